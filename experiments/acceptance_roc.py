@@ -26,8 +26,8 @@ from ms_slam_env.slam.shared.alignment_check import (
 )
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds, is_nearly_accepted
-from ms_slam_env.slam.surfel.map_search import FrameLookup
-from ms_slam_env.slam.surfel.relocalization import Images
+from ms_slam_env.slam.surfel.keyframe_search import Images
+from ms_slam_env.slam.surfel.submaps import FrameLookup
 
 Float64 = NDArray[np.float64]
 

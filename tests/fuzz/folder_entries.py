@@ -79,14 +79,14 @@ def call_policy(data: bytes, folder: Path) -> None:
 
 # --- studies -----------------------------------------------------------------------------------
 
-PARAMETERS = ("depth_cutoff_m=1:9", "keyframe_deg=0:10", "least_inliers=0:1")
+PARAMETERS = ("depth_cutoff_m=1:9", "keyframe_deg=0:10", "keyframe_m=0:1")
 SETTINGS = ExplorationSettings(sampler="random")
 
 
 def evaluate(configuration: SlamConfiguration) -> dict[str, Any]:
     """Something smooth."""
-    cutoff, angle, inliers = (configuration.slam_config[p.split("=")[0]] for p in PARAMETERS)
-    error = 0.01 + 0.01 * (inliers - 0.3) ** 2 + 0.05 / cutoff
+    cutoff, angle, reach = (configuration.slam_config[p.split("=")[0]] for p in PARAMETERS)
+    error = 0.01 + 0.01 * (reach - 0.3) ** 2 + 0.05 / cutoff
     return {"ate_m": error, "ext_ms": 2.0 + cutoff + 3 / (1 + angle), "M_I": 0.01, "M_D": 0.02}
 
 

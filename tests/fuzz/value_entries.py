@@ -52,7 +52,7 @@ def is_finite(value: Any) -> bool:
 SLAM_YAML = b"""slam: odometry
 slam_config:
   depth_cutoff_m: 4.0
-  least_inliers: 0.3
+  keyframe_m: 0.3
   keyframe_deg: 10
 image_size: 16x12
 keep_every: 1
@@ -318,7 +318,7 @@ def call_frames(name: str, frames: Any, folder: Path) -> None:
 
 COMMANDS = (
     "evaluate s/groundtruth.txt s/groundtruth.txt --align se3 --delta 1 --segments 2 --out o",
-    "run s --backend odometry --image-size 16x12 --params least_inliers=0.3 --out o",
+    "run s --backend odometry --image-size 16x12 --params keyframe_m=0.3 --out o",
     "divergence s --image-size 16x12 --out o",
     "generate table:0:none+handheld,frames=2 --image-size 16x12 --out o",
     "compare --sequences s --backends odometry --image-size 16x12 --workers 1 --out o/nope/\0",

@@ -248,7 +248,6 @@ def test_the_change_may_be_counted_per_second(frames):
         ({"name": "divergence", "thresholds": [0.2, 0.1]}, "must be 2 positive"),
         ({"name": "divergence", "release_share": 0}, "release_share = 0 is outside"),
         ({"name": "divergence", "per": "metre"}, "valid choices: frame, second"),
-        ({"name": "divergence", "robust_when_lost": 1}, "must be true or false"),
     ],
 )
 def test_bad_options(options, message):

@@ -25,7 +25,7 @@ from ms_slam_env.slam.shared.alignment_check import (
     status_on_appeal,
 )
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, measure_alignment, overlay
-from ms_slam_env.slam.shared.search_poses import MOTIONS, motion_hypotheses
+from ms_slam_env.slam.shared.tracking_template import MOTIONS, motion_hypotheses
 
 CAMERA = Intrinsics(fx=80.0, fy=84.0, cx=39.3, cy=29.8, width=80, height=60)
 REST = np.eye(4)

@@ -9,7 +9,7 @@ from ms_slam_env import slam
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.sequences import HandheldPath, Sequence, open_sequence
 from ms_slam_env.slam.surfel import color_cameras
-from ms_slam_env.slam.surfel.color_registration import depth_edges, estimate_registration
+from ms_slam_env.slam.surfel.color_cameras import depth_edges, estimate_camera_offset
 
 PATH = HandheldPath(40)
 FOCAL_RATIO, BASELINE_M = 525 / 585, 0.025  # of the perturbation
@@ -48,14 +48,14 @@ def test_edges_are_where_depth_steps_on_the_near_side(apart):
 
 def test_the_offset_is_found_and_none_where_there_is_none(apart, together):
     colors = [frame.color for frame in apart.frames]
-    found = estimate_registration(colors, _edges(apart), apart.intrinsics)
+    found = estimate_camera_offset(colors, _edges(apart), apart.intrinsics)
     assert found is not None
     assert found.focal_ratio == pytest.approx(FOCAL_RATIO, abs=0.012)
     assert found.baseline_m == pytest.approx(BASELINE_M, abs=0.005)
     colors = [frame.color for frame in together.frames]
-    assert estimate_registration(colors, _edges(together), together.intrinsics) is None
+    assert estimate_camera_offset(colors, _edges(together), together.intrinsics) is None
     few = [points[:1] for points in _edges(apart)]
-    assert estimate_registration(colors, few, apart.intrinsics) is None
+    assert estimate_camera_offset(colors, few, apart.intrinsics) is None
 
 
 def _run(sequence: Sequence, variant: str) -> tuple[slam.SlamBackend, np.ndarray]:

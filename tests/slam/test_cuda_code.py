@@ -16,24 +16,11 @@ from ms_slam_env._runtime.warp import wp
 
 HOPPER = 90
 MODULES = (
-    "acceptance",
-    "block_bounds",
-    "frustum_culling",
-    "fusion",
-    "map_deformation",
-    "normal_equations",
-    "photometry",
-    "pose_hypotheses",
-    "preprocessing",
-    "pyramid",
-    "rolling_shutter",
-    "solver",
-    "splatting",
-    "surfel_culling",
-    "surfel_update",
-    "view_warping",
+    *("acceptance", "free_space_mask", "frustum_culling", "map_deformation", "normal_equations"),
+    *("photometry", "pose_hypotheses", "preprocessing", "rendering", "rolling_shutter", "solver"),
+    *("surfel_map", "surfel_update", "view_prediction"),
 )
-IN_REGISTERS = ("frustum_culling", "fusion", "splatting", "surfel_update")
+IN_REGISTERS = ("frustum_culling", "rendering", "surfel_update")
 
 
 @pytest.mark.parametrize("name", MODULES)

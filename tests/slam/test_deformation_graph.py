@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ms_slam_env.geometry import make_pose, so3_exp, transform_points
 from ms_slam_env.slam.shared.rows import join
-from ms_slam_env.slam.surfel.deformation_graph import (
+from ms_slam_env.slam.surfel.map_deformation import (
     NEIGHBOURS,
     TWIST_M,
     W_CON,

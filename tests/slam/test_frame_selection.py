@@ -27,7 +27,11 @@ from ms_slam_env.slam.frame_selection import (
     SelectiveSlam,
     make_config,
 )
-from ms_slam_env.slam.frame_selection.budget import BudgetFilter
+from ms_slam_env.slam.frame_selection.budget import (
+    HIGHEST_THRESHOLD,
+    LOWEST_THRESHOLD,
+    BudgetFilter,
+)
 from ms_slam_env.slam.frame_selection.filters import Change, ChangeConfig, RegularSkipping
 from ms_slam_env.slam.slam_backend import Loop, SlamBackend, TrackResult, Views
 
@@ -193,22 +197,6 @@ def test_the_divergence_filter_is_the_obvious_one(frames, threshold, reference):
     assert threshold == 0 or not all(expected)
 
 
-def test_a_slow_motion_is_not_seen_against_the_frame_before(box_scene):
-    sensor = RGBDSensor(box_scene, CAMERA, noise="none")
-    slow = make_pose(so3_exp([0, np.radians(-0.5), 0]), [0.01, 0, 0])
-    poses = [START]
-    for _ in range(20):
-        poses.append(poses[-1] @ slow)
-    frames = [sensor.capture(pose, k, timestamp=k / 30) for k, pose in enumerate(poses)]
-    shares = {}
-    for reference in ("processed", "previous"):
-        config = make_config("divergence", threshold=0.01, reference=reference, max_skip=100)
-        managed = config.manage(Recorder())
-        shares[reference] = np.mean([managed.track(frame).processed for frame in frames])
-    assert shares["previous"] <= 2 / 21  # the first frames alone
-    assert shares["processed"] >= 3 * shares["previous"]
-
-
 def test_a_camera_at_rest_is_left_alone_and_one_that_moves_is_followed(frames):
     managed = make_config("divergence", threshold=0.004).manage(_surfel())
     results = [managed.track(frame) for frame in frames]
@@ -292,7 +280,7 @@ def test_the_budget_converges_to_its_share(levels, share, gain):
     processed = _processed(config, changes)
     # What is owed stays between ln(lowest / start) / gain and ln(highest / start) / gain; the
     # forced frames of a long gap come on top of a debt that is paid back.
-    bound = np.log(config.highest_threshold / config.lowest_threshold) / gain + config.max_skip
+    bound = np.log(HIGHEST_THRESHOLD / LOWEST_THRESHOLD) / gain + config.max_skip
     assert abs(processed.sum() - share * len(changes)) <= bound
 
 
@@ -318,8 +306,8 @@ def test_a_budget_a_second_is_kept_in_its_own_unit():
 
 
 def test_what_lies_below_the_lowest_threshold_is_dropped_however_rich_one_is():
-    config = BudgetConfig(share=0.9, lowest_threshold=0.005, max_skip=1000)
-    assert _processed(config, [0.001] * 300).sum() == 1
+    config = BudgetConfig(share=0.9, max_skip=1000)
+    assert _processed(config, [LOWEST_THRESHOLD / 2] * 300).sum() == 1
 
 
 def test_measured_costs_are_kept_too(monkeypatch):
@@ -487,18 +475,14 @@ def test_a_state_goes_on_bit_exactly(name, frames):
         ({"name": "regular", "every": 0.5}, r"RegularConfig.every = 0.5 is outside \[1, "),
         ({"name": "regular", "every": 12}, "drops 11 frames in a row, more than max_skip = 10"),
         ({"name": "divergence", "threshold": -1}, "threshold = -1 is outside"),
-        ({"name": "divergence", "threshold": float("nan")}, "threshold = nan is outside"),
-        ({"name": "divergence", "max_skip": 2.5}, "max_skip = 2.5 must be an integer"),
         ({"name": "divergence", "pose": "guess"}, "valid choices: last, constant-velocity"),
         ({"name": "divergence", "change": {"widht": 3}}, r"change.widht.*valid choices: width"),
         ({"name": "divergence", "change": 3}, "must be a mapping of options: width"),
         ({"name": "budget", "share": 0.05}, "max_skip = 10 has 1 of 11 frames processed"),
-        ({"name": "budget", "share": 1.5}, r"share = 1.5 is outside"),
         ({"name": "budget", "measured": True}, "of use with budget_per_s only"),
         ({"name": "budget", "cost_per_frame": 3.0}, "of use with budget_per_s only"),
-        ({"name": "budget", "measured": "yes"}, "must be true or false"),
         ({"name": "budget", "threshold": 1e-5}, "threshold = 1e-05 is outside"),
-        ({"name": "budget", "highest_threshold": 1e-3}, "highest_threshold = 0.001 is outside"),
+        ({"name": "budget", "threshold": 20.0}, "threshold = 20.0 is outside"),
     ],
 )
 def test_bad_options_are_named(options, message):

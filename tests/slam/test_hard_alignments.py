@@ -17,7 +17,6 @@ from box_scene import BoxScene
 from ms_slam_env import slam
 from ms_slam_env import slam as slam_backends
 from ms_slam_env.camera import RGBDFrame, xtion
-from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, orthonormal, relative_angle, se3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene
@@ -231,8 +230,3 @@ def test_the_share_of_inliers_that_is_demanded_is_an_option(inliers: float, fuse
     slam.reset(start)
     frames = [sensor.capture(start, index=k) for k in range(4)]
     assert [slam.track(frame).fused for frame in frames] == fused
-
-
-def test_only_booleans_are_taken() -> None:
-    with pytest.raises(InputError, match="refuse_bad_fits"):
-        slam_backends.make("surfel", xtion("80x60"), refuse_bad_fits="no")

@@ -11,7 +11,6 @@ from box_scene import BoxScene
 
 from ms_slam_env import slam
 from ms_slam_env.camera import xtion
-from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, se3_exp, so3_exp, transform_points
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.configuration import SlamConfiguration
@@ -167,17 +166,3 @@ def test_its_parameters_can_be_explored():
     config = space.configuration(values).slam_config
     assert config["iterations"] == [10, 5, 0]
     slam.make("kinectfusion", CAMERA, **config)
-
-
-@pytest.mark.parametrize(
-    ("options", "complaint"),
-    [
-        ({"mu_m": 0.6}, r"KinectFusionConfig.mu_m = 0.6 is outside \[0.001, 0.5\]"),
-        ({"iterations": [1, -1]}, "must be 1 to 5 integers in"),
-        ({"volume_resolution": 100.5}, "must be an integer"),
-        ({"icp_treshold": 1.0}, "valid choices: .*icp_threshold"),
-    ],
-)
-def test_bad_parameters_are_refused(options, complaint):
-    with pytest.raises(InputError, match=complaint):
-        slam.make("kinectfusion", CAMERA, **options)

@@ -7,21 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ms_slam_env import scenes, slam
+from ms_slam_env import scenes
 from ms_slam_env.camera import RGBDFrame, xtion
-from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, make_pose, relative_angle, se3_exp
 from ms_slam_env.sequences import render_sequence
+from ms_slam_env.slam.shared.alignment_check import TrackingStatus
 from ms_slam_env.slam.shared.ferns import Candidate
 from ms_slam_env.slam.surfel import SurfelConfig
-from ms_slam_env.slam.surfel.deformation_graph import (
+from ms_slam_env.slam.surfel.acceptance import Alignment
+from ms_slam_env.slam.surfel.map_deformation import (
     Deformation,
+    creation_times,
     identity,
     pack,
     sample_graph,
     unpack,
 )
-from ms_slam_env.slam.surfel.map_deformation import creation_times
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.surfel_config import LoopConfig
 
@@ -138,14 +139,23 @@ def test_a_keyframe_closes_a_loop_that_is_out_of_sight(
     assert errors(results[-1].T_world_camera, poses[TURN + 5]) < 0.005
 
 
-def test_a_drift_greater_than_the_way_permits_is_refused(
-    turn: tuple[list[RGBDFrame], np.ndarray],
+@pytest.mark.parametrize("by", ["drift", "status"])
+def test_a_keyframe_too_far_for_the_way_or_a_refused_alignment_closes_nothing(
+    turn: tuple[list[RGBDFrame], np.ndarray], by: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames, poses = turn
-    strict = replace(
-        CONFIG, loops=replace(CONFIG.loops, largest_m=0.001, global_interval=2, drift_share=0.001)
-    )
-    system = map_with_drift(frames, poses, strict)
+    loops = replace(CONFIG.loops, largest_m=0.001, global_interval=2)
+    if by == "drift":
+        loops = replace(loops, drift_share=0.001)
+    system = map_with_drift(frames, poses, replace(CONFIG, loops=loops))
+    if by == "status":
+        align, refused = system.loops._aligner.from_keyframes, TrackingStatus.IMPLAUSIBLE_MOTION
+
+        def all_refused(starts: np.ndarray) -> Alignment | None:
+            found = align(starts)
+            return None if found is None else found.with_status(np.ones(1, dtype=bool), refused)
+
+        monkeypatch.setattr(system.loops._aligner, "from_keyframes", all_refused)
     for k in range(KNOWN, TURN + 6):
         assert not system.track(*images(frames, k))[0].loop_closed
 
@@ -160,7 +170,7 @@ def test_places_that_only_look_alike_are_refused() -> None:
     poses = np.stack([straight_down @ make_pose(np.eye(3), [-x, 0, 0]) for x in steps])
     frames = list(render_sequence(scene, poses, CAMERA, noise="none").frames)
     system = BatchedSurfelSlam(
-        1, CAMERA, replace(CONFIG, loops=replace(CONFIG.loops, global_interval=2))
+        1, CAMERA, replace(CONFIG, loops=replace(CONFIG.loops, global_interval=2, drift_share=10.0))
     )
     for k in range(len(frames)):
         system.fuse(*images(frames, k), poses[k][None])
@@ -232,24 +242,3 @@ def test_creation_times_spread_the_surfels_of_a_frame_over_it() -> None:
     order, times = creation_times(np.array([3, 0, 0, 7, 3, 3, 0, 0], dtype=np.int32))
     np.testing.assert_array_equal(order, [1, 2, 6, 7, 0, 4, 5, 3])
     np.testing.assert_allclose(times, [0, 0.25, 0.5, 0.75, 3, 3 + 1 / 3, 3 + 2 / 3, 7])
-
-
-def test_without_loop_closure_no_trajectory_is_kept() -> None:
-    system = slam.make("surfel", CAMERA)
-    frame = RGBDFrame(np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32))
-    assert not system.track(frame).loop_closed
-    assert len(system.corrected_trajectory()[1]) == 0
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"loop_closure": "perfect"}, "deformation"),
-        ({"loops": {"windows": 3}}, "window"),
-        ({"loops": {"window": 0}}, "window"),
-        ({"loops": {"coverage": 2.0}}, "coverage"),
-    ],
-)
-def test_bad_parameters_are_refused(values: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        slam.make("surfel", CAMERA, **values)

@@ -8,12 +8,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from ms_slam_env import slam
-from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.sequences import HandheldPath, open_sequence
 from ms_slam_env.slam.surfel.backend import SurfelSlam
-from ms_slam_env.slam.surfel.image_pieces import Pieces
+from ms_slam_env.slam.surfel.preprocessing import Pieces
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
@@ -156,17 +154,6 @@ def test_known_poses_are_masked_too() -> None:
     found = results[-1].moving
     truth = labels[-1][:: labels.shape[1] // len(found), :: labels.shape[1] // len(found)]
     assert (found & truth).sum() > 0.7 * truth.sum()
-
-
-def test_a_running_slam_keeps_its_motion_mask() -> None:
-    system = slam.make("surfel", recorded(STILL)[0], motion_mask="geometric")
-    with pytest.raises(InputError, match="motion_mask"):
-        system.reconfigure(replace(system.config, motion_mask="none"))
-
-
-def test_an_unknown_motion_mask_is_refused() -> None:
-    with pytest.raises(InputError, match="none, geometric"):
-        SurfelConfig(motion_mask="semantic")
 
 
 def corner(height: int = 12, width: int = 16) -> tuple[np.ndarray, np.ndarray]:

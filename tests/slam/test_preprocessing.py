@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics, xtion
-from ms_slam_env.slam.surfel.preprocessing import Preprocessor
-from ms_slam_env.slam.surfel.pyramid import EDGE_FRACTION, Pyramid
+from ms_slam_env.slam.surfel.preprocessing import EDGE_FRACTION, SIGMA_PX, Preprocessor, Pyramid
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
 CAMERA = Intrinsics(fx=20.0, fy=21.0, cx=11.3, cy=7.7, width=24, height=16)
@@ -41,7 +40,7 @@ def _bilateral_along(inverse: np.ndarray, axis: int, config: SurfelConfig) -> np
             near = inverse[tuple(place)]
             ratio = (near - inverse[index]) / (2 * config.bilateral_sigma_m)
             if abs(ratio) < 1:
-                spatial = np.exp(-(offset**2) / (2 * config.bilateral_sigma_px**2))
+                spatial = np.exp(-(offset**2) / (2 * SIGMA_PX**2))
                 weight_sum += spatial * (1 - ratio**2) ** 2
                 value_sum += spatial * (1 - ratio**2) ** 2 * near
         result[index] = value_sum / weight_sum
@@ -157,22 +156,3 @@ def test_gradient_is_exact_on_a_ramp():
     (level,) = Pyramid(1, [(16, 24)], True).build(vertices, vertices, ramp)
     expected = np.stack([3 * u - 2 * v, np.full_like(u, 3), np.full_like(u, -2)], -1)
     np.testing.assert_allclose(level.gradient.numpy()[0], expected)
-
-
-def test_a_batch_equals_its_frames_alone():
-    frames = [_random_frame(seed) for seed in range(3)]
-    together = Preprocessor(3, CAMERA, CONFIG)(
-        np.stack([f[0] for f in frames]), np.stack([f[1] for f in frames])
-    )
-    for index, (color, depth) in enumerate(frames):
-        alone = Preprocessor(1, CAMERA, CONFIG)(color[None], depth[None])
-        for name in ("depth", "vertices", "normals", "color", "intensity"):
-            np.testing.assert_array_equal(
-                getattr(together, name).numpy()[index], getattr(alone, name).numpy()[0]
-            )
-
-
-@pytest.mark.parametrize("value", [float("nan"), -0.1, 12.5])
-def test_bad_cutoff_is_refused(value):
-    with pytest.raises(ValueError, match="depth_cutoff_m"):
-        SurfelConfig(depth_cutoff_m=value)

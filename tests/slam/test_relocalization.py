@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,15 +11,14 @@ from box_scene import BoxScene
 from surfel_scenes import ray_cast
 
 from ms_slam_env import slam
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
-from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.shared.alignment_check import is_photometrically_consistent
 from ms_slam_env.slam.shared.alignment_measures import measure_photometric_consistency
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
-from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization
-from ms_slam_env.slam.surfel.relocalization import Images
+from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization, Images
 
 CAMERA = xtion("160x120")
 OPTIONS = {"max_surfels": 120_000, "depth_cutoff_m": 4.0}
@@ -176,11 +177,6 @@ def test_a_camera_at_rest_is_not_encoded_again(monkeypatch):
     assert seen == [0, 1, 0, 1, 1]
 
 
-def test_an_unknown_variant_is_refused():
-    with pytest.raises(InputError, match="ferns, features, local"):
-        slam.make("surfel", CAMERA, relocalisation="sift")
-
-
 VIEW = Intrinsics(fx=80.0, fy=84.0, cx=39.3, cy=29.8, width=80, height=60)
 
 
@@ -216,6 +212,25 @@ def test_a_frame_is_consistent_with_the_view_from_its_pose_only():
     ahead = _consistency(frame, _view(make_pose(np.eye(3), [0.0, 0.0, 0.3])))
     assert ahead.inlier_ratio < 0.05
     assert not is_photometrically_consistent(ahead)
+
+
+def test_only_poses_from_which_the_map_looks_like_the_frame_are_verified():
+    """Both frames are those from the first place; the second map is seen from beside it."""
+    tangent = np.cross([0.3, -0.2, -1.0], [0.0, 1.0, 0.0])
+    beside = make_pose(np.eye(3), 0.3 * tangent / np.linalg.norm(tangent))
+    color, depth = (np.stack(pair) for pair in zip(*[_view(np.eye(4))] * 2, strict=True))
+    views = [_view(pose) for pose in (np.eye(4), beside)]
+    grey = np.stack(
+        [view[0].astype(np.float32) @ np.float32([0.299, 0.587, 0.114]) for view in views]
+    )
+    vertices = np.zeros((2, *VIEW.shape, 3), dtype=np.float32)
+    vertices[..., 2] = [view[1] for view in views]
+    shown = SimpleNamespace(intensity=wp.array(grey), vertices=wp.array(vertices))
+    aligner = SimpleNamespace(render=lambda poses: shown)
+    ferns = FernRelocalization(2, VIEW, 10.0)
+    poses, found = np.tile(np.eye(4), (2, 1, 1)), np.ones(2, dtype=bool)
+    verified = ferns.verify(Images(color, depth), poses, found, aligner)
+    assert verified.tolist() == [True, False]
 
 
 def test_consistency_asks_neither_for_exposure_nor_for_texture():

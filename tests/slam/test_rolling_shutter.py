@@ -12,8 +12,8 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, se3_exp
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.sequences import RollingShutter, render_sequence
-from ms_slam_env.slam.surfel.relocalization import Images
-from ms_slam_env.slam.surfel.rolling_shutter import make_shutter
+from ms_slam_env.slam.surfel.keyframe_search import Images
+from ms_slam_env.slam.surfel.rolling_shutter import Shutter
 
 CAMERA = xtion("160x120")
 READOUT_S, INTERVAL_S = 0.03, 1 / 30
@@ -49,7 +49,7 @@ def clean(box_scene: BoxScene) -> RGBDFrame:
 
 
 def _levelled(frame: RGBDFrame, motion: np.ndarray, interval_s: float = INTERVAL_S) -> Images:
-    shutter = make_shutter(1, READOUT_S, "cpu")
+    shutter = Shutter(1, READOUT_S, "cpu")
     shutter.use(CAMERA)
     for time in (0.0, interval_s):
         shutter.take_time([time])

@@ -125,17 +125,6 @@ def test_a_full_turn_closes_a_loop(circle, before_the_loop):
     assert np.mean(turned["closed"]) < 0.6 * np.mean(turned["open"])
 
 
-def test_loops_go_with_the_state(circle, before_the_loop):
-    closed, _ = _close(circle, before_the_loop, loops=True)
-    other = SparseSlam(CAMERA)
-    other.set_state(closed.get_state())
-    assert other.loops_closed == closed.loops_closed
-    assert other.loops_closed > 0
-    frame = circle[1][5]
-    first, second = closed.track(frame, circle[0][5]), other.track(frame, circle[0][5])
-    np.testing.assert_array_equal(first.T_world_camera, second.T_world_camera)
-
-
 def test_a_map_with_closed_loops_is_gone_on_from_bit_exactly(circle, before_the_loop, tmp_path):
     closed, _ = _close(circle, before_the_loop, loops=True)
     closed.save(tmp_path / "map.npz")
@@ -262,13 +251,8 @@ def test_parameters_are_checked():
     for name, value in (
         ("features", 5),
         ("levels", 0),
-        ("hamming", 0),
-        ("pixel_noise", 0.0),
-        ("inverse_depth_noise", float("nan")),
-        ("least_matches", 3),
-        ("keyframe_deg", 120.0),
+        ("depth_cutoff_m", float("nan")),
         ("window", 1),
-        ("loop_gap", 0),
         ("loops", 1),
         ("max_surfels", 3.5),
     ):
@@ -281,16 +265,3 @@ def test_without_gtsam_one_line_says_what_to_install(monkeypatch):
     with pytest.raises(InputError, match=r"pip install 'ms-slam-env\[gtsam\]'") as error:
         slam.make("sparse", CAMERA)
     assert "\n" not in str(error.value)
-
-
-def test_poses_stay_rigid(circle):
-    poses, frames = circle
-    backend = SparseSlam(CAMERA)
-    backend.reset(START)
-    for frame in frames[:10]:
-        result = backend.track(frame)
-    R = result.T_world_camera[:3, :3]
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
-    motion = invert(START) @ result.T_world_camera
-    truth = invert(poses[0]) @ poses[9]
-    np.testing.assert_allclose(motion[:3, 3], truth[:3, 3], atol=0.02)

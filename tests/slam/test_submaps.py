@@ -21,7 +21,7 @@ from ms_slam_env.geometry import (
 )
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.shared.submap_frames import SubmapLedger
-from ms_slam_env.slam.surfel.detached_map import DetachedMap
+from ms_slam_env.slam.surfel.trajectory_history import DetachedMap
 
 CAMERA = xtion("160x120")
 OPTIONS = {"max_surfels": 120_000, "submaps": "atlas", "submap_rules": {"after": 3}}

@@ -1,14 +1,20 @@
-"""Batches, states and capacity of the surfel map."""
+"""The surfel map: batches, capacity, windows of frames, the thinned view for tracking."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from surfel_scenes import SMALL, build_map, device_poses, fuse, live_frame
 
+from ms_slam_env._runtime.warp import wp
+from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import make_pose, so3_exp
+from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+from ms_slam_env.slam.surfel.surfels import any_time
+from ms_slam_env.slam.surfel.tracker import model_stride
 
 CONFIG = SurfelConfig(max_surfels=6000, compaction_interval=3, unstable_window=4)
 
@@ -69,21 +75,6 @@ def test_three_envs_at_once_are_bit_identical_to_three_alone() -> None:
         assert np.mean(np.abs(shared - own.depth) < 1e-3) > 0.95
 
 
-def test_a_restored_state_goes_on_bit_exactly() -> None:
-    poses = path(1, 10)
-    original = build_map(poses[:5], noise_m=0.003, compaction_interval=3)
-    saved = original.get_state()
-    restored = SurfelMap(1, SMALL, original.config)
-    restored.set_state(saved)
-    assert_same_state(saved, restored.get_state())
-    for t in range(5, 10):
-        live = live_frame(poses[t][None], noise_m=0.003, rng=np.random.default_rng(t))
-        fuse(original, live, poses[t][None], t)
-        fuse(restored, live, poses[t][None], t)
-    assert_same_state(original.get_state(), restored.get_state())
-    assert original.count() != len(saved["surfels"][0]["radius"])  # time did go on
-
-
 def test_a_full_map_drops_surfels_and_recovers() -> None:
     config = SurfelConfig(max_surfels=1000, compaction_interval=5)
     surfel_map = SurfelMap(1, SMALL, config)
@@ -142,3 +133,92 @@ def test_many_workers_do_what_one_does() -> None:
     views = [m.render_model(device_poses(poses[:1])) for m in maps]
     depth = [view.vertices.numpy()[..., 2] for view in views]
     np.testing.assert_allclose(depth[0], depth[1], atol=1e-5)  # sums in another order
+
+
+AT_REST = np.tile(np.eye(4), (2, 1, 1))
+
+
+def two_maps() -> SurfelMap:
+    """Two equal maps of one frame, whose left halves were seen last in frame 3 and 7."""
+    surfel_map = SurfelMap(2, SMALL, SurfelConfig(max_surfels=20_000))
+    fuse(surfel_map, live_frame(AT_REST), AT_REST, 0)
+    state = surfel_map.get_state()
+    for surfels, time in zip(state["surfels"], (3, 7), strict=True):
+        surfels["seen"][surfels["position"][:, 0] < 0] = time
+    surfel_map.set_state(state)
+    return surfel_map
+
+
+def test_only_surfels_of_the_window_are_drawn_in_each_env() -> None:
+    surfel_map = two_maps()
+    everything = surfel_map.render_model(device_poses(AT_REST)).vertices.numpy()
+    surfel_map.active.seen_from.assign([3, 8])
+    view = surfel_map.render_model(device_poses(AT_REST)).vertices.numpy()
+    left = (everything[..., 2] > 0) & (everything[..., 0] < -0.1)
+    right = (everything[..., 2] > 0) & (everything[..., 0] > 0.1)
+    np.testing.assert_array_equal(view[0][left[0]], everything[0][left[0]])
+    assert (view[0][right[0]] == 0).all()
+    assert (view[1] == 0).all()
+
+
+def test_another_renderer_draws_another_window() -> None:
+    surfel_map = two_maps()
+    old = any_time(2, "cpu")
+    old.seen_to.assign([2, 2])
+    renderer = surfel_map.model_renderer(1, old)
+    renderer.cull(device_poses(AT_REST))
+    view = renderer.splat().vertices.numpy()
+    drawn = view[..., 2] > 0
+    assert drawn.any()
+    assert (view[drawn][:, 0] > -0.1).all()
+
+
+def test_surfels_outside_the_window_take_no_part_in_fusion() -> None:
+    surfel_map = two_maps()
+    before = surfel_map.get_state()["surfels"]
+    surfel_map.active.seen_from.assign([3, 8])
+    fuse(surfel_map, live_frame(AT_REST), AT_REST, 9)
+    after = surfel_map.get_state()["surfels"]
+    old = len(before[0]["seen"])
+    is_left = before[0]["position"][:, 0] < 0
+    np.testing.assert_array_equal(after[0]["seen"][:old] == 9, is_left)
+    np.testing.assert_array_equal(after[1]["confidence"][:old], before[1]["confidence"])
+    assert len(after[1]["seen"]) == 2 * old  # all readings start new surfels
+
+
+POSES = np.stack(
+    [make_pose(so3_exp([0.01 * k, -0.02 * k, 0.0]), [0.02 * k, 0.0, 0.01 * k]) for k in range(4)]
+)
+
+
+@pytest.mark.parametrize("stride", [2, 4])
+def test_a_thinned_view_has_the_pixels_of_the_whole_one(stride):
+    whole_map = build_map(POSES[:3], noise_m=0.003)
+    thin_map = SurfelMap(1, SMALL, whole_map.config, model_stride=stride)
+    thin_map.set_state(whole_map.get_state())
+    whole = whole_map.render_model(device_poses(POSES[3:]))
+    thin = thin_map.render_model(device_poses(POSES[3:]))
+    for name, tolerance in (("vertices", 1e-4), ("normals", 1e-3), ("color", 0.05)):
+        expected = getattr(whole, name).numpy()[:, ::stride, ::stride]
+        found = getattr(thin, name).numpy()
+        assert found.shape == expected.shape
+        # A pixel on the very rim of a disc may fall to either side of it.
+        same = (np.abs(found - expected) < tolerance).all(axis=-1)
+        assert same.mean() > 0.99
+    assert (thin.vertices.numpy()[..., 2] > 0).mean() > 0.5
+
+
+@pytest.mark.parametrize(("size", "stride"), [("80x60", 1), ("160x120", 2), ("320x240", 4)])
+def test_the_view_is_as_thin_as_the_last_iteration_allows(size, stride):
+    assert model_stride(xtion(size), SurfelConfig()) == stride
+    assert model_stride(xtion(size), SurfelConfig(points_per_level=1_000_000)) == 1
+
+
+def test_a_mirror_writes_and_reads_the_device_array():
+    mirror = HostDeviceBuffer((2,), wp.mat44, "cpu")
+    values = np.arange(32.0).reshape(2, 4, 4)
+    mirror.write(values)
+    np.testing.assert_array_equal(mirror.array.numpy(), values)
+    read = mirror.read()
+    mirror.write(np.zeros((2, 4, 4)))
+    np.testing.assert_array_equal(read, values)

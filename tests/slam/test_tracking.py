@@ -14,9 +14,8 @@ from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.geometry import invert, look_at, relative_angle, se3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.shared.alignment_check import TrackingStatus
-from ms_slam_env.slam.surfel import alignment_arrays as aa
+from ms_slam_env.slam.surfel import normal_equations as aa
 from ms_slam_env.slam.surfel.acceptance import acceptance_thresholds
-from ms_slam_env.slam.surfel.gauss_newton import weights_of
 from ms_slam_env.slam.surfel.normal_equations import accumulate_normal_equations
 from ms_slam_env.slam.surfel.photometry import same_exposure
 from ms_slam_env.slam.surfel.pose_hypotheses import NUM_HYPOTHESES, tracking_hypotheses
@@ -24,7 +23,7 @@ from ms_slam_env.slam.surfel.preprocessing import LiveFrame, Preprocessor
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.solver import reduce_sums
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
-from ms_slam_env.slam.surfel.tracker import Tracker
+from ms_slam_env.slam.surfel.tracker import Tracker, weights_of
 
 SMALL = Intrinsics(fx=24.0, fy=24.0, cx=15.5, cy=11.5, width=32, height=24)
 T_WORLD_MODEL = look_at([-0.8, -0.8, 1.2], [1.2, 0.1, 0.5])

@@ -13,11 +13,15 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.slam.surfel import view_prediction
-from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import SplatCamera
-from ms_slam_env.slam.surfel.view_prediction import mean_pose, wide_intrinsics
-from ms_slam_env.slam.surfel.view_warping import EMPTY, PointCloud, scatter_points
+from ms_slam_env.slam.surfel.view_prediction import (
+    EMPTY,
+    PointCloud,
+    mean_pose,
+    scatter_points,
+    wide_intrinsics,
+)
 
 LUMA = np.array([0.299, 0.587, 0.114])
 WIDE_PATH = np.stack(
@@ -109,13 +113,6 @@ def test_of_dozens_of_surfels_to_a_pixel_some_are_enough(
     assert np.percentile(np.abs(enough.depth - every.depth), 95) < 0.005
     monkeypatch.setattr(view_prediction, "LAYERS", 0.01)
     assert (wide_map.predict(poses, 0.25).depth[0] > 0).mean() < 0.5
-
-
-def test_an_empty_map_predicts_nothing() -> None:
-    views = SurfelMap(1, SMALL, SurfelConfig(max_surfels=1000)).predict(CANDIDATES, 0.5)
-    assert (views.depth == 0).all()
-    assert (views.intensity == 0).all()
-    assert (views.normals == 0).all()
 
 
 def test_prediction_repeats_bit_exactly_and_leaves_the_map_alone(wide_map: SurfelMap) -> None:

@@ -12,7 +12,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.configuration import SlamConfiguration
 from ms_slam_env.tuning import ExplorationSettings, SearchSpace, explore, make_space
 
-PARAMETERS = ("depth_cutoff_m=1:9", "keyframe_deg=0:10", "least_inliers=0:1")
+PARAMETERS = ("depth_cutoff_m=1:9", "keyframe_deg=0:10", "keyframe_m=0:1")
 """Of the odometry backend, whose parameters are checked without loading kernels."""
 
 
@@ -45,11 +45,11 @@ class FakeEvaluation:
 
 
 def values(params: dict[str, Any], lost_from: float = 8.0) -> dict[str, Any]:
-    cutoff, angle, inliers = (
-        params[name] for name in ("depth_cutoff_m", "keyframe_deg", "least_inliers")
+    cutoff, angle, reach = (
+        params[name] for name in ("depth_cutoff_m", "keyframe_deg", "keyframe_m")
     )
     measured = {
-        "ate_m": 0.01 + 0.01 * (inliers - 0.3) ** 2 + 0.05 / cutoff,
+        "ate_m": 0.01 + 0.01 * (reach - 0.3) ** 2 + 0.05 / cutoff,
         "ext_ms": 2.0 + cutoff + 3.0 / (1.0 + angle),
         "M_I": 0.01,
         "M_D": 0.02,

@@ -137,7 +137,10 @@ def test_a_range_holds_what_lies_in_it(low, size, value):
         (["speed"], "unknown parameter 'speed'; valid choices: depth_cutoff_m"),
         (["iterations.7"], "unknown parameter 'iterations.7'"),
         (["loops.speed=1:2"], "unknown parameter 'loops.speed'"),
-        (["lateral_noise_px"], "parameter 'lateral_noise_px' needs a range, as in lateral_noise_p"),
+        (
+            ["bilateral_sigma_m"],
+            "parameter 'bilateral_sigma_m' needs a range, as in bilateral_sigma_",
+        ),
         (["depth_cutoff_m=5:7"], "'depth_cutoff_m' starts at 8.0, which is not one of 5 to 7"),
         (["depth_cutoff_m=5:1"], "range 5.0:1.0 holds no values"),
         (["depth_cutoff_m=0:5:log"], "holds no values"),

@@ -157,7 +157,6 @@ class DivergenceAdaptationConfig(SwitchingConfig):
         dwell_frames: down only as far as the largest change of so many frames permits.
         levels: file that an exploration wrote, whose configurations, thresholds and costs are
             taken in place of these; None from then on.
-        robust_when_lost: the most robust configuration while tracking is lost, and so long after.
         per: the change per ``frame`` or, by the time stamps, per ``second``.
         change: how the change between frames is measured.
 
@@ -170,7 +169,6 @@ class DivergenceAdaptationConfig(SwitchingConfig):
     thresholds: tuple[float, ...] = (0.004, 0.01)
     release_share: float = bounded(0.7, 0.001, 1)
     dwell_frames: int = bounded(6, 1, 1_000_000)
-    robust_when_lost: bool = True
     per: str = chosen("frame", "frame", "second")
     change: ChangeConfig = field(default_factory=ChangeConfig)
     levels: str | Path | None = None
@@ -234,7 +232,7 @@ class DivergenceController(Saved, Controller):
         if is_first:
             return self.index
         config = self._config
-        change = inf if is_lost and config.robust_when_lost else self.change
+        change = inf if is_lost else self.change
         self._recent = [*self._recent, change][-config.dwell_frames :]
         self.index = max(self.index, bisect_right(config.thresholds, change))
         if len(self._recent) == config.dwell_frames:

@@ -14,6 +14,9 @@ from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import OrNone
 
+LOWEST_THRESHOLD = 1e-4  # a frame that changes less is dropped though it could be afforded
+HIGHEST_THRESHOLD = 10.0  # a frame that changes more is processed though it cannot be afforded
+
 
 class ThresholdController(Saved):
     """Raises a threshold with what was spent and lowers it with what was allowed.
@@ -73,8 +76,6 @@ class BudgetConfig(DroppingConfig):
             too many or too few. Slower lets quiet stretches pay for violent ones, faster keeps the
             budget over shorter times.
         threshold: to begin with, nats.
-        lowest_threshold: a frame that changes less is dropped though it could be afforded.
-        highest_threshold: a frame that changes more is processed though it cannot be afforded.
         change: how it is measured.
 
     Raises:
@@ -90,14 +91,11 @@ class BudgetConfig(DroppingConfig):
     measured: bool = False
     gain: float = bounded(0.1, 1e-6, 10)
     threshold: float = 0.01
-    lowest_threshold: float = bounded(1e-4, 1e-9, 1e6)
-    highest_threshold: float = 10.0
     change: ChangeConfig = field(default_factory=ChangeConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, "threshold", self.lowest_threshold, 1e6)
-        check_range(self, "highest_threshold", self.threshold, 1e6)
+        check_range(self, "threshold", LOWEST_THRESHOLD, HIGHEST_THRESHOLD)
         if self.budget_per_s is not None:
             return
         if self.measured or self.cost_per_frame != 1 or self.cost_per_look != 0:
@@ -129,7 +127,7 @@ class BudgetFilter(Saved, FrameFilter):
         self._config = config
         self._change = change
         self._controller = ThresholdController(
-            config.threshold, config.gain, config.lowest_threshold, config.highest_threshold
+            config.threshold, config.gain, LOWEST_THRESHOLD, HIGHEST_THRESHOLD
         )
         self.reset()
 

@@ -21,9 +21,8 @@ from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.odometry.semi_dense import SemiDenseAligner
 from ms_slam_env.slam.shared.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, check_alignment
-from ms_slam_env.slam.shared.search_poses import motion_hypotheses
 from ms_slam_env.slam.shared.state_check import ArrayOf, OrNone
-from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam
+from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam, motion_hypotheses
 from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M, BorrowedMap, Float64
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
@@ -38,9 +37,6 @@ class OdometryConfig(Checked):
         depth_cutoff_m: readings beyond are ignored.
         keyframe_m: the keyframe is renewed when the camera is this far from it,
         keyframe_deg: or turned by this much.
-        least_overlap: share of a frame's readings that the image it is aligned with must show,
-        least_inliers: share of those that must fit its depth,
-        least_alike: share of those that must fit its intensity.
         max_surfels: capacity of the map; None as in ``SurfelConfig``.
         aligner: what aligns two images: ``opencv`` (depth and intensity of all pixels) or
             ``semi-dense`` (intensity of pixels with a marked gradient, as LSD-SLAM tracks).
@@ -52,9 +48,6 @@ class OdometryConfig(Checked):
     depth_cutoff_m: float = bounded(4.0, 0.1, LARGEST_CUTOFF_M)
     keyframe_m: float = bounded(0.04, 0.0, 1.0)
     keyframe_deg: float = bounded(3.0, 0.0, 90.0)
-    least_overlap: float = bounded(0.3, 0.0, 1.0)
-    least_inliers: float = bounded(0.75, 0.0, 1.0)
-    least_alike: float = bounded(0.9, 0.0, 1.0)
     max_surfels: int | None = bounded(None, 1000, 50_000_000)
     aligner: str = chosen("opencv", "opencv", "semi-dense")
     stock: bool = False
@@ -134,7 +127,7 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
             if self.config.aligner == "semi-dense"
             else Aligner(intrinsics, self.config.depth_cutoff_m)
         )
-        self._judge_views(self.config)
+        self._judge_views(self.config.stock)
         kept = {name: getattr(self.config, name) for name in ("depth_cutoff_m", "max_surfels")}
         self._map = SurfelSlam(intrinsics, SurfelConfig(**kept))
         super().__init__(intrinsics)

@@ -17,6 +17,13 @@ from ms_slam_env.slam.slam_backend import Float64, Views
 
 _LOOKS_AT = 0.2  # share of a frame that the other map must show for the frame to be compared
 _FAR_M = 10.0
+LEAST_OVERLAP = 0.05  # share of the pixels with a reading that must fit the other map
+LEAST_CONSISTENT = 0.85  # share of those that fit among those that fit or contradict
+LEAST_ALIKE = 0.5
+"""Correlation of the images' fine structure with the other map's view.
+
+The median over the frames that look at it.
+"""
 
 
 @dataclass(frozen=True)
@@ -26,17 +33,10 @@ class FitConfig(Checked):
     Attributes:
         queries: frames of each map that are laid upon the other.
         tolerance_m: depth differs from the other map where it differs by more than this.
-        least_overlap: share of the pixels with a reading that must fit the other map.
-        least_consistent: share of those that fit among those that fit or contradict.
-        least_alike: correlation of the images' fine structure with the other map's view, the
-            median over the frames that look at it.
     """
 
     queries: int = bounded(24, 1, 10_000)
     tolerance_m: float = bounded(0.05, 1e-4, 1.0)
-    least_overlap: float = bounded(0.05, 0.0, 1.0)
-    least_consistent: float = bounded(0.85, 0.0, 1.0)
-    least_alike: float = bounded(0.5, -1.0, 1.0)
 
 
 class MapRenderer(Protocol):
@@ -76,13 +76,13 @@ class Fit:
     alike: float = float("nan")
 
 
-def why_not_believed(fit: Fit, config: FitConfig) -> str:
+def why_not_believed(fit: Fit) -> str:
     """Why maps that fit so are not taken to show the same place; empty if they are."""
-    if fit.overlap < config.least_overlap:
+    if fit.overlap < LEAST_OVERLAP:
         return "the maps hardly overlap there"
-    if fit.consistent < config.least_consistent:
+    if fit.consistent < LEAST_CONSISTENT:
         return "the surfaces contradict each other there"
-    if not fit.alike >= config.least_alike:
+    if not fit.alike >= LEAST_ALIKE:
         return "the images do not look alike there"
     return ""
 

@@ -39,26 +39,27 @@ class Features(Rows):
         return intrinsics.rays_at(self.pixels) * depth[:, None]
 
 
+_FAST_THRESHOLD = 7  # least contrast of a corner, grey levels
+_DETECTION_WIDTH = 320
+"""Smaller images are magnified to this width before features are sought.
+
+ORB describes a patch of 31 pixels, a fifth of an image of 160.
+"""
+
+
 class FeatureExtractor:
     """Finds and describes corners evenly over the image; for the options see ``SparseConfig``."""
 
-    def __init__(
-        self,
-        intrinsics: Intrinsics,
-        features: int = 600,
-        levels: int = 4,
-        fast_threshold: int = 7,
-        detection_width: int = 320,
-    ) -> None:
+    def __init__(self, intrinsics: Intrinsics, features: int = 600, levels: int = 4) -> None:
         self._count = features
         self._shape = intrinsics.shape
-        self._magnify = max(1, round(detection_width / intrinsics.width))
+        self._magnify = max(1, round(_DETECTION_WIDTH / intrinsics.width))
         self._orb = cv2.ORB.create(
             nfeatures=_CANDIDATES * features,
             scaleFactor=SCALE,
             nlevels=levels,
             edgeThreshold=_EDGE_PX,
-            fastThreshold=fast_threshold,
+            fastThreshold=_FAST_THRESHOLD,
         )
 
     def __call__(self, grey: NDArray[np.uint8], inverse_depth: InverseDepth) -> Features:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, check_frame
-from ms_slam_env.geometry import check_pose, invert
+from ms_slam_env.geometry import check_pose, invert, make_pose, orthonormal, so3_exp
 from ms_slam_env.slam.shared.alignment_check import (
     FEWEST_READINGS,
     NO_ALIGNMENT,
@@ -19,8 +19,44 @@ from ms_slam_env.slam.shared.alignment_check import (
     AcceptanceThresholds,
     AlignmentStatistics,
 )
+from ms_slam_env.slam.shared.alignment_measures import DepthImage, overlay
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.slam_backend import Float64, SlamBackend, TrackResult
+
+TURN_RAD = np.radians(10.0)
+STEP_M = 0.1
+_TRIALS = 6  # motions that are tried, of all that are compared
+_SAMPLES = 600  # readings that a motion is judged by
+
+
+def _signed_axes(size: float) -> Float64:
+    """Vectors (7, 3): none, and both ways along each axis."""
+    return size * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+
+
+MOTIONS = np.stack(
+    [
+        make_pose(so3_exp(turn), step)
+        for turn in _signed_axes(float(TURN_RAD))
+        for step in _signed_axes(STEP_M)
+    ]
+)
+"""Motions (49, 4, 4): no turn or one of 10 degrees, with no step or one of 10 cm."""
+
+
+def motion_hypotheses(
+    frame: DepthImage, reference: DepthImage, T_last_camera: Float64, intrinsics: Intrinsics
+) -> Float64:
+    """Motions T_reference_frame (7, 4, 4) to search from, in the order of trial.
+
+    First the last motion ``T_last_camera`` (4, 4), should it go on; then the best of ``MOTIONS``,
+    judged by how well they lay the frame over the reference, in depth and intensity.
+    """
+    # What goes on from frame to frame is made rigid: pose times last motion, frame after frame,
+    # multiplies rounding errors of the rotation by 2.4 each time.
+    scores = overlay(frame, reference, MOTIONS, intrinsics, _SAMPLES).scores
+    best = np.argsort(-scores, kind="stable")[:_TRIALS]
+    return np.concatenate([orthonormal(T_last_camera)[None], MOTIONS[best]])
 
 
 class PreparedFrame(Protocol):
@@ -66,18 +102,11 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         self.intrinsics = intrinsics
         self.reset()
 
-    def _judge_views(self, config: Any) -> None:
-        """Demand of an alignment with a view the shares in ``config``; nothing of a stock one."""
-        self._thresholds = AcceptanceThresholds()
-        if config.stock:
+    def _judge_views(self, is_stock: bool) -> None:
+        """Demand ``VIEW_THRESHOLDS`` of an alignment with a view; nothing of a stock one."""
+        self._thresholds = AcceptanceThresholds() if is_stock else VIEW_THRESHOLDS
+        if is_stock:
             self.fewest_readings = 0.0
-        else:
-            self._thresholds = replace(
-                VIEW_THRESHOLDS,
-                overlap=config.least_overlap,
-                inlier_ratio=config.least_inliers,
-                photometric_inlier_ratio=config.least_alike,
-            )
 
     def reset(self, T_world_camera: ArrayLike | None = None) -> None:
         """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""

@@ -19,7 +19,7 @@ from ms_slam_env.slam.shared.point_poses import (
     residuals,
 )
 from ms_slam_env.slam.slam_backend import Float64
-from ms_slam_env.slam.sparse.sparse_config import SparseConfig
+from ms_slam_env.slam.sparse.sparse_config import INVERSE_DEPTH_NOISE, PIXEL_NOISE
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
 _BASELINE_M = 0.1  # of the imagined second camera; the result does not depend on it
@@ -140,20 +140,18 @@ def _robust(gtsam: Any, covariance: Float64) -> Any:
     return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(covariance))
 
 
-def adjust_around(sparse_map: SparseMap, keyframe: int, config: SparseConfig) -> None:
-    """Adjust a keyframe, those that share most points with it, and the points that they see.
+def adjust_around(sparse_map: SparseMap, keyframe: int, size: int) -> None:
+    """Adjust ``size`` keyframes, those that share most points with one, and the points they see.
 
     Other keyframes that see these points hold them in place. Sightings that do not fit afterwards
     are forgotten.
     """
-    window, anchors = _choose_keyframes(sparse_map, keyframe, config)
+    window, anchors = _choose_keyframes(sparse_map, keyframe, size)
     keyframes = window + anchors
     fixed = np.array([sparse_map.keyframes[k].known for k in window] + [True] * len(anchors))
     if not fixed.any():
         fixed[window.index(min(window))] = True
-    bundle, feature, ids = _gather(
-        sparse_map, keyframes, fixed, sparse_map.points_of(window), config
-    )
+    bundle, feature, ids = _gather(sparse_map, keyframes, fixed, sparse_map.points_of(window))
     if len(feature) == 0:
         return
     poses, points = adjust_bundle(bundle, sparse_map.intrinsics)
@@ -164,10 +162,10 @@ def adjust_around(sparse_map: SparseMap, keyframe: int, config: SparseConfig) ->
 
 
 def _choose_keyframes(
-    sparse_map: SparseMap, keyframe: int, config: SparseConfig
+    sparse_map: SparseMap, keyframe: int, size: int
 ) -> tuple[list[int], list[int]]:
     """Keyframes that are adjusted, and others that hold them in place."""
-    window = [keyframe, *sparse_map.neighbours(keyframe, config.window - 1)]
+    window = [keyframe, *sparse_map.neighbours(keyframe, size - 1)]
     others = [k for k in range(len(sparse_map.keyframes)) if k not in window]
     counts = sparse_map.shared(sparse_map.points_of(window), others)
     order = np.argsort(-counts, kind="stable")[:_MOST_FIXED]
@@ -179,7 +177,6 @@ def _gather(
     keyframes: list[int],
     fixed: NDArray[np.bool_],
     point_ids: Int64,
-    config: SparseConfig,
 ) -> tuple[Bundle, Int64, Int64]:
     """The points seen twice or more, the feature of each sighting, and the ids of the points."""
     frames = [sparse_map.keyframes[k] for k in keyframes]
@@ -195,8 +192,8 @@ def _gather(
     seen = Sightings(
         np.concatenate([frame.features.pixels[f] for frame, f in pairs])[often],
         np.concatenate([frame.features.inverse_depth[f] for frame, f in pairs])[often],
-        config.pixel_noise * scale,
-        config.inverse_depth_noise,
+        PIXEL_NOISE * scale,
+        INVERSE_DEPTH_NOISE,
     )
     poses = np.stack([frame.T_world_camera for frame in frames])
     bundle = Bundle(poses, fixed, sparse_map.positions[used], camera, point, seen)

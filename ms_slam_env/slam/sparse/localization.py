@@ -18,9 +18,16 @@ from ms_slam_env.slam.shared.rows import join
 from ms_slam_env.slam.shared.tracking_template import Attempt
 from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.sparse.patches import Patches, Templates, find_patches
-from ms_slam_env.slam.sparse.sparse_config import SparseConfig
+from ms_slam_env.slam.sparse.sparse_config import (
+    HAMMING,
+    INVERSE_DEPTH_NOISE,
+    LEAST_MATCHES,
+    PIXEL_NOISE,
+)
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
+_LEAST_OVERLAP = 0.3  # share of a frame's readings that the keyframe beside it must show
+_LEAST_INLIERS, _LEAST_ALIKE = 0.75, 0.8  # shares of those that must fit its depth, its intensity
 _SAME_PX = 1.0  # corners closer than this to a point's place are that point
 _RADIUS = 0.045  # of the search for a point, share of the image's width
 _NEIGHBOURS = 6  # keyframes, besides the reference, whose points are looked for
@@ -68,15 +75,13 @@ class Fix:
 class Localizer:
     """Places frames in a map."""
 
-    def __init__(self, sparse_map: SparseMap, config: SparseConfig) -> None:
+    def __init__(self, sparse_map: SparseMap) -> None:
         self._map = sparse_map
-        self._config = config
-        self._least = config.least_matches
         self._intrinsics: Intrinsics = sparse_map.intrinsics
         self._thresholds = AcceptanceThresholds(  # a keyframe may be anywhere that sees the same
-            overlap=config.least_overlap,
-            inlier_ratio=config.least_inliers,
-            photometric_inlier_ratio=config.least_alike,
+            overlap=_LEAST_OVERLAP,
+            inlier_ratio=_LEAST_INLIERS,
+            photometric_inlier_ratio=_LEAST_ALIKE,
         )
 
     def near(self, frame: LiveFrame, T_world_camera: Float64, reference: int) -> Fix | None:
@@ -89,7 +94,7 @@ class Localizer:
         candidates = self._map.points_of(keyframes)
         T = T_world_camera
         ids, features = self._match(frame, candidates, T)
-        if len(ids) >= self._least:
+        if len(ids) >= LEAST_MATCHES:
             seen = self._sightings(frame.features, features)
             T, inlier = refine_pose(T, self._map.positions[ids], seen, self._intrinsics)
             ids, features = ids[inlier], features[inlier]
@@ -97,7 +102,7 @@ class Localizer:
             reference = keyframes[int(counts.argmax())]
         visible, projected = self._project(candidates, T)
         ids, features, seen = self._register(frame, T, visible, projected, ids, features)
-        if len(ids) < self._least:
+        if len(ids) < LEAST_MATCHES:
             return None
         T, inlier = refine_pose(T, self._map.positions[ids], seen, self._intrinsics)
         return Fix(
@@ -117,7 +122,7 @@ class Localizer:
             frame.tree,
             frame.features.descriptors,
             _RADIUS * self._intrinsics.width,
-            self._config.hamming,
+            HAMMING,
         )
         return visible[points], features
 
@@ -126,14 +131,14 @@ class Localizer:
         other = self._map.keyframes[keyframe]
         theirs = np.flatnonzero(other.point_ids >= 0)
         a, b = match_anywhere(
-            other.features.descriptors[theirs], frame.features.descriptors, self._config.hamming
+            other.features.descriptors[theirs], frame.features.descriptors, HAMMING
         )
-        if len(a) < self._least:
+        if len(a) < LEAST_MATCHES:
             return None
         points = self._map.positions[other.point_ids[theirs[a]]]
-        error_px = _RANSAC_SIGMAS * self._config.pixel_noise * 1.5
+        error_px = _RANSAC_SIGMAS * PIXEL_NOISE * 1.5
         found = pose_from_matches(points, frame.features.pixels[b], self._intrinsics, error_px)
-        if found is None or found[1].sum() < self._least * 2 // 3:
+        if found is None or found[1].sum() < LEAST_MATCHES * 2 // 3:
             return None
         T, inlier = found
         seen = self._sightings(frame.features, b[inlier])
@@ -143,8 +148,8 @@ class Localizer:
         """Judge a pose by its matches, and by depth and intensity of the keyframe beside it."""
         explained = len(fix.point_ids)
         reason, found = "", NO_ALIGNMENT
-        if explained < self._least:
-            reason = f"only {explained} corners match the map, of {self._least} needed"
+        if explained < LEAST_MATCHES:
+            reason = f"only {explained} corners match the map, of {LEAST_MATCHES} needed"
         elif explained < _LEAST_EXPLAINED * fix.matches:
             reason = f"only {explained} of {fix.matches} matching corners fit one pose"
         else:
@@ -159,8 +164,8 @@ class Localizer:
         return Sightings(
             features.pixels[which],
             features.inverse_depth[which],
-            self._config.pixel_noise * features.scale[which],
-            self._config.inverse_depth_noise,
+            PIXEL_NOISE * features.scale[which],
+            INVERSE_DEPTH_NOISE,
         )
 
     def _project(self, point_ids: Int64, T_world_camera: Float64) -> tuple[Int64, Float64]:
@@ -203,7 +208,7 @@ class Localizer:
             np.concatenate([pixels, other.pixels]),
             np.concatenate([frame.inverse_depth.at(pixels), other.inverse_depth]),
             np.concatenate([sigma, other.sigma_px]),
-            self._config.inverse_depth_noise,
+            INVERSE_DEPTH_NOISE,
         )
         all_ids = np.concatenate([sharp, ids[rest]])
         return all_ids, feature_of[all_ids], seen

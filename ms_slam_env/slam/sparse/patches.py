@@ -1,4 +1,4 @@
-"""Small patches around features, and their registration in another image.
+"""Small patches around features, and their alignment with another image.
 
 ORB's corners lie on whole pixels of their level, and come and go. A patch is warped as the motion
 and its surface demand and then shifted until it fits (Lucas and Kanade; the warp as in SVO, Forster

@@ -16,9 +16,9 @@ from ms_slam_env.slam.shared.state_check import ArrayOf
 from ms_slam_env.slam.slam_backend import Float64, Loop
 from ms_slam_env.slam.sparse.local_mapping import load_gtsam
 from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer
-from ms_slam_env.slam.sparse.sparse_config import SparseConfig
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
+_LOOP_GAP = 10  # keyframes between a frame and one that it may close a loop with
 _FIXED_SIGMA = 1e-6
 _ITERATIONS = 20
 _CANDIDATES = 3  # keyframes that are looked at
@@ -65,10 +65,9 @@ def optimise_poses(poses: Float64, edges: Sequence[Edge], fixed: NDArray[np.bool
 class LoopCloser(Stateful):
     """Closes loops of a map."""
 
-    def __init__(self, sparse_map: SparseMap, localizer: Localizer, config: SparseConfig) -> None:
+    def __init__(self, sparse_map: SparseMap, localizer: Localizer) -> None:
         self._map = sparse_map
         self._localizer = localizer
-        self._config = config
         self.edges: list[Edge] = []  # of all loops closed so far
 
     def close(self, keyframe: int, frame: LiveFrame) -> Loop | None:
@@ -83,7 +82,7 @@ class LoopCloser(Stateful):
 
     def _candidates(self, keyframe: int) -> list[int]:
         """Old keyframes that look like one and do not see its points already."""
-        old = keyframe - self._config.loop_gap
+        old = keyframe - _LOOP_GAP
         if old < 1:
             return []
         frames = self._map.keyframes

@@ -27,9 +27,15 @@ from ms_slam_env.slam.slam_backend import BorrowedMap, Float64, Loop, TrackResul
 from ms_slam_env.slam.sparse.local_mapping import adjust_around, load_gtsam
 from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer, keyframe_features
 from ms_slam_env.slam.sparse.pose_graph import LoopCloser
-from ms_slam_env.slam.sparse.sparse_config import SparseConfig
+from ms_slam_env.slam.sparse.sparse_config import LEAST_MATCHES, PIXEL_NOISE, SparseConfig
 from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
+
+_KEYFRAME_M, _KEYFRAME_DEG = 0.1, 8.0
+"""A frame becomes a keyframe this far from the others in sight, or turned by this much."""
+_ENOUGH_MATCHES = 60  # a share of that where fewer matches explain its pose, see ``_SOONER``
+_REMAP_M, _REMAP_DEG = 0.005, 0.3
+"""The dense map is made anew when a keyframe has moved by this much since it was fused."""
 
 
 class DenseMap(Saved):
@@ -38,7 +44,6 @@ class DenseMap(Saved):
     saved = ("_surfels", "_poses", "_fused")
 
     def __init__(self, intrinsics: Intrinsics, config: SparseConfig) -> None:
-        self._config = config
         self._surfels = SurfelSlam(
             intrinsics,
             SurfelConfig(
@@ -84,7 +89,7 @@ class DenseMap(Saved):
             return False
         moved_m = float(np.linalg.norm(placed[:3, 3] - pose[:3, 3]))
         turned = np.degrees(relative_angle(placed[:3, :3], pose[:3, :3]))
-        return moved_m > self._config.remap_m or turned > self._config.remap_deg
+        return moved_m > _REMAP_M or turned > _REMAP_DEG
 
 
 _LOOKALIKES = 4  # keyframes in which a lost camera is sought
@@ -102,10 +107,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
         load_gtsam()
         self.intrinsics = intrinsics
         self.config = config or SparseConfig()
-        kept = ("features", "levels", "fast_threshold", "detection_width")
-        self._extract = FeatureExtractor(
-            intrinsics, **{name: getattr(self.config, name) for name in kept}
-        )
+        self._extract = FeatureExtractor(intrinsics, self.config.features, self.config.levels)
         self._dense = DenseMap(intrinsics, self.config)
         super().__init__(intrinsics)
 
@@ -120,14 +122,14 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
 
     @property
     def _no_attempt(self) -> str:
-        return f"fewer than {self.config.least_matches} of the frame's corners match the map"
+        return f"fewer than {LEAST_MATCHES} of the frame's corners match the map"
 
     def _clear(self) -> None:
         self._reference = self._frame = 0
         self._loop: Loop | None = None  # that the frame in hand has closed
         self._map = SparseMap(self.intrinsics)
-        self._localizer = Localizer(self._map, self.config)
-        self._loops = LoopCloser(self._map, self._localizer, self.config)
+        self._localizer = Localizer(self._map)
+        self._loops = LoopCloser(self._map, self._localizer)
         self._dense.clear()
 
     @property
@@ -176,7 +178,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
 
     def _why_no_start(self, prepared: LiveFrame) -> str:
         corners = int((prepared.features.inverse_depth > 0).sum())
-        if corners < self.config.least_matches:
+        if corners < LEAST_MATCHES:
             return f"the first frame has only {corners} corners with depth"
         return ""
 
@@ -237,13 +239,13 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
         beside = self._map.keyframes[fix.reference].T_world_camera
         moved = float(np.linalg.norm(fix.T_world_camera[:3, 3] - beside[:3, 3]))
         turned = relative_angle(fix.T_world_camera[:3, :3], beside[:3, :3])
-        share = 1.0 if len(fix.point_ids) >= self.config.enough_matches else _SOONER
-        limit = np.radians(self.config.keyframe_deg)
-        return moved > share * self.config.keyframe_m or turned > share * limit
+        share = 1.0 if len(fix.point_ids) >= _ENOUGH_MATCHES else _SOONER
+        limit = np.radians(_KEYFRAME_DEG)
+        return moved > share * _KEYFRAME_M or turned > share * limit
 
     def _insert(self, frame: RGBDFrame, live: LiveFrame, fix: Fix | None, known: bool) -> None:
         """Make a frame a keyframe, adjust the map around it, and close a loop if there is one."""
-        features, point_ids = keyframe_features(live, fix, self._map, self.config.pixel_noise)
+        features, point_ids = keyframe_features(live, fix, self._map, PIXEL_NOISE)
         keyframe = Keyframe(
             T_world_camera=self._pose,
             known=known,
@@ -255,11 +257,11 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
             depth=live.image.depth,
         )
         self._reference = index = self._map.add(keyframe)
-        adjust_around(self._map, index, self.config)
+        adjust_around(self._map, index, self.config.window)
         if self.config.loops:
             self._loop = self._loops.close(index, live.showing(features))
         if self._loop is not None:
-            adjust_around(self._map, index, self.config)
+            adjust_around(self._map, index, self.config.window)
         self._pose = keyframe.T_world_camera.copy()
         self._dense.place(self._map.keyframes)
 

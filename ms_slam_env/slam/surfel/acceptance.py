@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.shared.alignment_check import (
     AcceptanceThresholds,
@@ -21,29 +21,27 @@ from ms_slam_env.slam.shared.alignment_check import (
     evaluate_on_device,
 )
 from ms_slam_env.slam.slam_backend import Float64
-from ms_slam_env.slam.surfel.alignment_arrays import Hypotheses, Sum
-from ms_slam_env.slam.surfel.degeneracy import (
-    eigen,
-    is_constrained,
-    mat66d,
-    mat76d,
-    pose_covariance,
-    vec6d,
-)
+from ms_slam_env.slam.surfel.normal_equations import Hypotheses, Sum
 from ms_slam_env.slam.surfel.solver import (
     cholesky,
     cholesky_solve,
+    eigen,
     invert_rigid,
+    is_constrained,
     load_terms,
+    mat66d,
+    mat76d,
     orthonormalise,
+    pose_covariance,
     se3_exp,
     se3_log,
+    vec6d,
 )
 from ms_slam_env.slam.surfel.surfel_config import AcceptanceConfig
 
 
 @wp.func
-def _squared_norm(H: mat66d, g: vec6d):
+def _squared_norm(H: mat66d, g: vec6d) -> wp.float64:
     """Value of g^T H^-1 g."""
     L = cholesky(H)
     total = wp.float64(0.0)
@@ -55,7 +53,7 @@ def _squared_norm(H: mat66d, g: vec6d):
 
 
 @wp.func
-def _conflict(A: mat66d, B: mat66d, g_a: vec6d, g_b: vec6d):
+def _conflict(A: mat66d, B: mat66d, g_a: vec6d, g_b: vec6d) -> wp.float64:
     """Chi squared of the difference between the minima of the geometric and photometric terms.
 
     min (x - x_a)^T A (x - x_a) + (x - x_b)^T B (x - x_b): what the joint minimum costs more than
@@ -68,7 +66,7 @@ def _conflict(A: mat66d, B: mat66d, g_a: vec6d, g_b: vec6d):
 
 
 @wp.func
-def in_metres_twist(xi: vec6d, length: wp.float64):
+def in_metres_twist(xi: vec6d, length: wp.float64) -> vec6d:
     """Twist with its rotation times ``length``."""
     scaled = xi
     for i in range(3, 6):
@@ -77,7 +75,7 @@ def in_metres_twist(xi: vec6d, length: wp.float64):
 
 
 @wp.func
-def _ratio(sums: wp.array3d(dtype=wp.float64), b: int, part: int, whole: int):
+def _ratio(sums: wp.array3d[wp.float64], b: int, part: int, whole: int) -> wp.float64:
     """Ratio of two sums of env b, of which the second is a count."""
     return sums[b, 0, part] / wp.max(sums[b, 0, whole], wp.float64(1.0))
 
@@ -91,7 +89,7 @@ def _without_open_directions(
     tilted: wp.float64,
     matched: wp.float64,
     length: wp.float64,
-):
+) -> wp.mat44d:
     """The pose T, but the predicted one along the directions that the view leaves open.
 
     Coarser levels may have moved along what turns out to be open.
@@ -110,14 +108,14 @@ def _without_open_directions(
 @wp.kernel
 def assess_alignment(
     hypotheses: Hypotheses,  # (B, 1); out: the pose where it is degenerate
-    predicted: wp.array(dtype=wp.mat44d),  # (B,) T_model_live
-    thresholds: wp.array(dtype=DeviceThresholds),  # (B,)
-    T_world_model: wp.array(dtype=wp.mat44d),  # in: pose of the model view
-    T_world_live: wp.array(dtype=wp.mat44d),  # out
-    status: wp.array(dtype=wp.int32),
-    statistics: wp.array(dtype=DeviceStatistics),
-    covariance: wp.array(dtype=mat66d),  # (B,) of the twist xi, T_world_live exp(xi)
-):
+    predicted: wp.array[wp.mat44d],  # (B,) T_model_live
+    thresholds: wp.array[DeviceThresholds],  # (B,)
+    T_world_model: wp.array[wp.mat44d],  # in: pose of the model view
+    T_world_live: wp.array[wp.mat44d],  # out
+    status: wp.array[wp.int32],
+    statistics: wp.array[DeviceStatistics],
+    covariance: wp.array[mat66d],  # (B,) of the twist xi, T_world_live exp(xi)
+) -> None:
     """Compare what the alignment explained with the thresholds; write status, figures and pose.
 
     Along directions that the view leaves open the pose is the predicted one.
@@ -160,6 +158,9 @@ def assess_alignment(
     statistics[b] = found
 
 
+LARGEST_SIGMA = 0.04  # (metres, radians) of the worst direction that the view constrains
+
+
 def acceptance_thresholds(
     config: AcceptanceConfig, strict: NDArray[np.bool_], lost: NDArray[np.int32]
 ) -> NDArray[Any]:
@@ -186,7 +187,7 @@ def _acceptance_thresholds(
     least = {"overlap": config.overlap, "inlier_ratio": config.inliers}
     least["photometric_inlier_ratio"] = config.alike
     most = {"depth_conflict_ratio": config.conflicts, "cost": config.cost}
-    ordinary = AcceptanceThresholds(config.points, sigma_m=config.sigma, **least, **most)
+    ordinary = AcceptanceThresholds(config.points, sigma_m=LARGEST_SIGMA, **least, **most)
     thresholds = ordinary.repeated(len(strict))
     for name, value in least.items():
         thresholds[name] = np.where(strict, max(_STRICT[name], value), value)
@@ -288,7 +289,7 @@ def is_nearly_accepted(alignment: Alignment, env: int, config: AcceptanceConfig)
         depth_conflict_ratio=max(doubted.conflicts, config.conflicts),
         photometric_inlier_ratio=min(doubted.alike, config.alike),
         cost=max(doubted.cost, config.cost),
-        sigma_m=config.sigma,
+        sigma_m=LARGEST_SIGMA,
     )
     return alignment.status_under(thresholds, env) == TrackingStatus.OK
 

@@ -14,10 +14,10 @@ from ms_slam_env.geometry import check_pose
 from ms_slam_env.slam.shared.state import check_has
 from ms_slam_env.slam.shared.submap_frames import Submaps
 from ms_slam_env.slam.slam_backend import Float64, SlamBackend, TrackResult, Views, check_views
-from ms_slam_env.slam.surfel.color_cameras import make_color_camera
-from ms_slam_env.slam.surfel.relocalization import Images
+from ms_slam_env.slam.surfel.color_cameras import EstimatedColorCamera
+from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
-from ms_slam_env.slam.surfel.submaps import make_submaps
+from ms_slam_env.slam.surfel.submaps import AtlasSubmaps
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
@@ -31,8 +31,9 @@ class SurfelSlam(SlamBackend):
         self.intrinsics = intrinsics
         self.device = device
         self._slam = BatchedSurfelSlam(1, intrinsics, config or SurfelConfig(), device)
-        self._submaps = make_submaps(self._slam)
-        self._color_camera = make_color_camera(self.config.color_registration)
+        self._submaps = AtlasSubmaps(self._slam)
+        is_estimated = self.config.color_registration == "estimated"
+        self._color_camera = EstimatedColorCamera() if is_estimated else None
 
     @property
     def config(self) -> SurfelConfig:
@@ -79,14 +80,18 @@ class SurfelSlam(SlamBackend):
         """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
         self._slam.reset(T_world_camera)
         self._submaps.reset()
-        self._color_camera.reset(T_world_camera)
+        if self._color_camera is not None:
+            self._color_camera.reset(T_world_camera)
 
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
         """Estimate the pose of ``frame`` and fuse it into the map; see ``SlamBackend``."""
         color, depth = self._images(frame)
         guess, time_s = T_world_camera_guess, frame.timestamp
-        result = self._color_camera.track(self._slam, color, depth, guess, time_s)
-        return self._submaps.follow(Images(color, depth), T_world_camera_guess, result)
+        if self._color_camera is None:
+            result = self._slam.track(color, depth, [guess], [time_s])[0]
+        else:
+            result = self._color_camera.track(self._slam, color, depth, guess, time_s)
+        return self._submaps.follow(Images(color, depth), guess, result)
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
         """Fuse ``frame`` into the map at a known pose (4, 4), without tracking."""
@@ -101,7 +106,10 @@ class SurfelSlam(SlamBackend):
         if self._slam.intrinsics != self.intrinsics:
             size = self.image_size
             color, depth = reduce_color(color, size), reduce_depth(depth, size)
-        return self._color_camera.registered(self._slam, color[None], depth[None]), depth[None]
+        color, depth = color[None], depth[None]
+        if self._color_camera is not None:
+            color = self._color_camera.registered(self._slam, color, depth)
+        return color, depth
 
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
         """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size."""
@@ -124,7 +132,7 @@ class SurfelSlam(SlamBackend):
         """Colour, normal, radius, confidence and submap of ``surface_points``."""
         living = {name: self._living(name) for name in ("normal", "radius", "confidence")}
         attributes: dict[str, NDArray[Any]] = {"color": self.surface_colors(), **living}
-        detached = self._submaps.detached()
+        detached = self._submaps.detached
         if detached:
             labels = [self._submaps.present, *(each.label for each in detached)]
             counts = [self.map.count(), *(int(each.living.sum()) for each in detached)]
@@ -134,7 +142,7 @@ class SurfelSlam(SlamBackend):
     def _living(self, name: str) -> NDArray[np.float32]:
         """Array ``name`` of the living surfels of all submaps."""
         present = self.map.attribute(name, stable=False)
-        others = [each.surfels[name][each.living] for each in self._submaps.detached()]
+        others = [each.surfels[name][each.living] for each in self._submaps.detached]
         return np.concatenate([present, *others]) if others else present
 
     def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
@@ -161,17 +169,18 @@ class SurfelSlam(SlamBackend):
 
     def get_state(self) -> dict[str, Any]:
         """Everything needed to go on bit-exactly, as NumPy arrays."""
-        own = self._color_camera.get_state() | {"submaps": self._submaps.get_state()}
-        return self._slam.get_state() | own
+        color = {} if self._color_camera is None else self._color_camera.get_state()
+        return self._slam.get_state() | color | {"submaps": self._submaps.get_state()}
 
     def state_like(self) -> Any:
         """See ``Stateful``."""
-        own = self._color_camera.state_like() | {"submaps": self._submaps.state_like()}
-        return self._slam.state_like() | own
+        color = {} if self._color_camera is None else self._color_camera.state_like()
+        return self._slam.state_like() | color | {"submaps": self._submaps.state_like()}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state that ``get_state`` returned."""
         check_has(state, ("submaps",), type(self).__name__)
         self._slam.set_state(state)
         self._submaps.set_state(state["submaps"])
-        self._color_camera.set_state(state)
+        if self._color_camera is not None:
+            self._color_camera.set_state(state)

@@ -1,18 +1,117 @@
-"""Whether colour is registered with depth, and what to do where it is not."""
+"""Whether colour is registered with depth, and what to do where it is not.
+
+The offset of the colour camera is found from the edges that colour and depth share. Objects end
+where depth steps, and mostly so does their colour: the offset is the one that puts the near sides
+of depth steps where the colour's gradient is steepest, summed over many frames (after Levinson and
+Thrun, "Automatic online calibration of cameras and lasers", RSS 2013).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import differential_evolution, minimize
 
+from ms_slam_env.camera import Intrinsics
 from ms_slam_env.camera.registration import Registration
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import ArrayOf, ListOf
 from ms_slam_env.slam.slam_backend import Float32, Float64, TrackResult
-from ms_slam_env.slam.surfel.color_registration import depth_edges, estimate_registration
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
+
+FEWEST_EDGES = 500  # points on depth steps that the offset is estimated from
+LEAST_GAIN = 1.1  # of their mean gradient, by which cameras are believed to be apart
+_STEP = 0.04  # of inverse depth, 1/m
+_RANGES = ((0.85, 1.15), (-0.06, 0.06))  # of focal ratio and baseline, metres
+_SIMPLEX = np.array([[0.0, 0.0], [0.01, 0.0], [0.0, 0.004]])
+_BLURS_PX = (1.5, 0.7)  # of the gradients: to find the place, and to find it exactly
+_STEEPEST = 3.0  # times the mean gradient: beyond it an edge is an edge
+_BORDER = 2  # rows and columns that are left out
+
+
+def depth_edges(depth: Float32, intrinsics: Intrinsics) -> Float64:
+    """Points (N, 3) on the near side of the steps of a depth image (H, W), between the pixels."""
+    K, inverse = intrinsics, np.where(depth > 0, 1 / np.maximum(depth, 1e-3), 0)
+    inside = np.zeros(depth.shape, dtype=bool)
+    inside[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
+    points = []
+    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        beside = np.roll(inverse, (-y, -x), (0, 1))
+        v, u = np.nonzero(inside & (beside > 0) & (inverse - beside > _STEP))
+        z = depth[v, u].astype(np.float64)
+        u_edge, v_edge = u + 0.5 * x, v + 0.5 * y
+        points.append(np.stack([(u_edge - K.cx) / K.fx * z, (v_edge - K.cy) / K.fy * z, z], 1))
+    return np.concatenate(points)
+
+
+def estimate_camera_offset(
+    colors: Sequence[NDArray[np.uint8]], edges: Sequence[Float64], intrinsics: Intrinsics
+) -> Registration | None:
+    """Focal ratio and baseline of the colour camera.
+
+    Args:
+        colors: images (H, W, 3) of the colour camera.
+        edges: points (N, 3) of each, as ``depth_edges`` finds them.
+        intrinsics: of the depth camera.
+
+    Returns:
+        None where there are too few edges, or those of colour and depth lie together as they are.
+    """
+    given = [(color, points) for color, points in zip(colors, edges, strict=True) if len(points)]
+    if sum(len(points) for _, points in given) < FEWEST_EDGES:
+        return None
+    places = [points for _, points in given]
+    coarse, fine = ([_gradient(color, blur) for color, _ in given] for blur in _BLURS_PX)
+
+    def against(gradients: Sequence[Float32], at: Float64) -> float:
+        return -_steepness(gradients, places, intrinsics, *at)
+
+    def cost(at: Float64) -> float:
+        return against(coarse, at)
+
+    found = differential_evolution(cost, _RANGES, maxiter=25, popsize=8, rng=0, polish=False)
+    best = minimize(
+        lambda at: against(fine, at),
+        found.x,
+        method="Nelder-Mead",
+        options={"maxfev": 200, "initial_simplex": found.x + _SIMPLEX},
+    )
+    if best.fun > LEAST_GAIN * against(fine, np.array([1.0, 0.0])):  # both are negative
+        return None
+    return Registration(float(best.x[0]), float(best.x[1]))
+
+
+def _gradient(color: NDArray[np.uint8], blur_px: float) -> Float32:
+    """Steepness (H, W) of an image's grey values, 1 on average."""
+    grey = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)) / 8
+    relative = np.minimum(slope / (slope.mean() + 1), _STEEPEST)
+    return np.asarray(cv2.GaussianBlur(relative, (0, 0), blur_px))
+
+
+def _steepness(
+    gradients: Sequence[Float32],
+    places: Sequence[Float64],
+    intrinsics: Intrinsics,
+    focal_ratio: float,
+    baseline_m: float,
+) -> float:
+    """Mean gradient at the places where a colour camera sees the edges."""
+    K, total = intrinsics, 0.0
+    for gradient, (x, y, z) in zip(gradients, (points.T for points in places), strict=True):
+        u = focal_ratio * K.fx * (x - baseline_m) / z + K.cx
+        v = focal_ratio * K.fy * y / z + K.cy
+        where = u.astype(np.float32)[None], v.astype(np.float32)[None]
+        total += cv2.remap(
+            gradient, *where, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        ).sum()
+    return total / sum(map(len, places))
+
 
 UInt8 = NDArray[np.uint8]
 
@@ -20,30 +119,8 @@ ENOUGH_EDGES = 6000  # points on depth steps, or
 MOST_FRAMES = 60  # frames after which the offset of the cameras is estimated
 
 
-class ColorCamera(Saved):
-    """The colour of one camera's frames. This is the variant "given": it is taken as it comes."""
-
-    def reset(self, T_world_camera: ArrayLike | None) -> None:
-        """Begin anew at a pose (4, 4)."""
-
-    def registered(self, slam: BatchedSurfelSlam, color: UInt8, depth: Float32) -> UInt8:
-        """Colour (1, H, W, 3) as the depth camera would see it."""
-        return color
-
-    def track(
-        self,
-        slam: BatchedSurfelSlam,
-        color: UInt8,
-        depth: Float32,
-        guess: ArrayLike | None,
-        time_s: float,
-    ) -> TrackResult:
-        """Let a frame be tracked."""
-        return slam.track(color, depth, [guess], [time_s])[0]
-
-
-class EstimatedColorCamera(ColorCamera):
-    """The variant "estimated": the offset is looked for in the first frames, and then undone.
+class EstimatedColorCamera(Saved):
+    """Where the colour camera is: looked for in the first frames, and then undone.
 
     Once it is found those frames, of which at most ``MOST_FRAMES`` are kept until then, are tracked
     once more with their colour registered, as a new map. Should one of them have been lost or fused
@@ -58,7 +135,7 @@ class EstimatedColorCamera(ColorCamera):
         self.reset(None)
 
     def reset(self, T_world_camera: ArrayLike | None) -> None:
-        """See the base class."""
+        """Begin anew at a pose (4, 4)."""
         self._start: Float64 = np.eye(4) if T_world_camera is None else np.array(T_world_camera)
         self._offset: Float64 = np.full(2, np.nan)  # focal ratio and baseline; NaN: not known yet
         self._is_whole = True  # nothing but the frames kept is in the map
@@ -82,7 +159,7 @@ class EstimatedColorCamera(ColorCamera):
         self._times: list[float] = []
 
     def registered(self, slam: BatchedSurfelSlam, color: UInt8, depth: Float32) -> UInt8:
-        """See the base class."""
+        """Colour (1, H, W, 3) as the depth camera would see it."""
         focal_ratio, baseline_m = self._offset.tolist()
         if not self._is_known or (focal_ratio, baseline_m) == (1.0, 0.0):
             return color
@@ -101,8 +178,8 @@ class EstimatedColorCamera(ColorCamera):
         guess: ArrayLike | None,
         time_s: float,
     ) -> TrackResult:
-        """See the base class."""
-        result = super().track(slam, color, depth, guess, time_s)
+        """Let a frame be tracked."""
+        result = slam.track(color, depth, [guess], [time_s])[0]
         if self._is_known:
             return result
         if self._depths and self._depths[0].shape != depth[0].shape:
@@ -116,7 +193,7 @@ class EstimatedColorCamera(ColorCamera):
         if self._edges < ENOUGH_EDGES and len(self._times) < MOST_FRAMES:
             return result
         edges = [depth_edges(one, slam.intrinsics) for one in self._depths]
-        found = estimate_registration(self._colors, edges, slam.intrinsics)
+        found = estimate_camera_offset(self._colors, edges, slam.intrinsics)
         camera = found or Registration(1.0, 0.0)
         self._offset = np.array([camera.focal_ratio, camera.baseline_m])
         if found is not None and self._is_whole:
@@ -131,10 +208,5 @@ class EstimatedColorCamera(ColorCamera):
         for color, depth, guess, time_s in kept:
             registered = self.registered(slam, color[None], depth[None])
             known = guess if np.isfinite(guess).all() else None
-            result = super().track(slam, registered, depth[None], known, time_s)
+            result = slam.track(registered, depth[None], [known], [time_s])[0]
         return result
-
-
-def make_color_camera(variant: str) -> ColorCamera:
-    """The variant ``SurfelConfig.color_registration``."""
-    return EstimatedColorCamera() if variant == "estimated" else ColorCamera()

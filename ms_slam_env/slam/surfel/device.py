@@ -17,7 +17,8 @@ from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 from ms_slam_env._runtime import warp as _warp
-from ms_slam_env._runtime.warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.shared.state import Stateful
 
@@ -75,26 +76,27 @@ def threads_per_row(width: int, device: str, gpu_columns: int = 1) -> tuple[int,
     return columns, -(-width // columns)
 
 
+_dtype: Any
 for _dtype in (wp.float32, wp.int32, wp.uint8, wp.vec3):
     _kind = "vec3" if _dtype is wp.vec3 else "number"
 
     @wp.func_native(native_source("arrays", f"fetch_{_kind}"))
-    def fetch(values: wp.array(dtype=_dtype), i: int) -> _dtype:
+    def fetch(values: wp.array[_dtype], i: int) -> _dtype:
         """Value ``i``."""
 
     @wp.func_native(native_source("arrays", f"fetch_{_kind}_in_row"))
-    def fetch(values: wp.array2d(dtype=_dtype), row: int, i: int) -> _dtype:
+    def fetch(values: wp.array2d[_dtype], row: int, i: int) -> _dtype:
         """Value ``i`` of a row."""
 
     @wp.func_native(native_source("arrays", f"put_{_kind}"))
-    def put(values: wp.array(dtype=_dtype), i: int, value: _dtype):
+    def put(values: wp.array[_dtype], i: int, value: _dtype) -> None:
         """Set value ``i``."""
 
     @wp.func_native(native_source("arrays", f"put_{_kind}_in_row"))
-    def put(values: wp.array2d(dtype=_dtype), row: int, i: int, value: _dtype):
+    def put(values: wp.array2d[_dtype], row: int, i: int, value: _dtype) -> None:
         """Set value ``i`` of a row."""
 
 
 @wp.func_native(native_source("arrays", "raise_to"))
-def raise_to(values: wp.array(dtype=wp.float32), i: int, value: wp.float32):
+def raise_to(values: wp.array[wp.float32], i: int, value: wp.float32) -> None:
     """Make value ``i`` at least ``value``, also when other threads do so at the same time."""

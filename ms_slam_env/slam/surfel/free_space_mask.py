@@ -1,3 +1,4 @@
+# ruff: noqa: UP018, RUF046
 """Which readings of the live frames belong to things that move, by geometry alone.
 
 A reading in space that an earlier frame saw to be free has come there: the free-space violation of
@@ -17,33 +18,338 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
+from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.slam_backend import Float64
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache
-from ms_slam_env.slam.surfel.image_pieces import Pieces
-from ms_slam_env.slam.surfel.motion_evidence import (
-    APPEARED,
-    KNOWN,
-    OLD,
-    PAST,
-    RECENT,
-    SUPPORTED,
-    UNUSED,
-    VANISHED,
-    carry_log_odds,
-    enlarge,
-    find_appeared,
-    find_vanished,
-    hide,
-    make_grid,
-    sample_depth,
-)
-from ms_slam_env.slam.surfel.motion_mask import Bool, Float32, MotionMask
-from ms_slam_env.slam.surfel.preprocessing import LiveFrame
+from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache, fetch, put
+from ms_slam_env.slam.surfel.preprocessing import LiveFrame, Pieces
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
+
+PAST = wp.constant(6)  # earlier frames that the live one is compared with
+KNOWN, SUPPORTED, APPEARED, VANISHED = (wp.constant(1 << bit) for bit in range(4))
+"""Of a reading: an earlier frame saw its place; it was there in an old one already; its place was
+free; what was in front of it has gone."""
+UNUSED, RECENT, OLD = (wp.constant(age) for age in range(3))
+RECEDED_M = wp.constant(0.6)  # what is farther behind did not recede there, but was uncovered
+NEAREST_M = wp.constant(0.03)  # smallest distance that is no noise
+
+
+@wp.struct
+class Grid:
+    """Every ``stride``-th row and column of the live images of B envs."""
+
+    stride: int
+    width: int
+    height: int
+    live_width: int
+    live_height: int
+    focal: wp.vec2
+    centre: wp.vec2
+    sigma: float  # tolerance at 1 m, grows with depth squared
+
+
+def make_grid(intrinsics: Intrinsics, columns: int, sigma: float) -> Grid:
+    """A grid of about so many columns; ``sigma`` is its tolerance at 1 m."""
+    stride = max(1, round(intrinsics.width / columns))
+    small = intrinsics.every_nth(stride)
+    grid = Grid()
+    grid.stride, grid.width, grid.height = stride, small.width, small.height
+    grid.live_width, grid.live_height = intrinsics.width, intrinsics.height
+    grid.focal, grid.centre = wp.vec2(small.fx, small.fy), wp.vec2(small.cx, small.cy)
+    grid.sigma = sigma
+    return grid
+
+
+@wp.func
+def tolerance(z: float, grid: Grid) -> float:
+    """Difference of depth, metres, that is neither noise nor an inexact pose."""
+    return wp.max(grid.sigma * z * z, NEAREST_M)
+
+
+@wp.func
+def place(p: wp.vec3, grid: Grid) -> int:
+    """Pixel of the grid where a point of the camera's frame is seen; -1 outside."""
+    if p[2] < 0.05:
+        return -1
+    u = int(grid.focal[0] * p[0] / p[2] + grid.centre[0] + 100.5) - 100
+    v = int(grid.focal[1] * p[1] / p[2] + grid.centre[1] + 100.5) - 100
+    if u < 0 or v < 0 or u >= grid.width or v >= grid.height:
+        return -1
+    return v * grid.width + u
+
+
+@wp.func
+def point(u: int, v: int, z: float, grid: Grid) -> wp.vec3:
+    """Point of the camera's frame at a pixel of the grid."""
+    x = (float(u) - grid.centre[0]) / grid.focal[0]
+    y = (float(v) - grid.centre[1]) / grid.focal[1]
+    return wp.vec3(z * x, z * y, z)
+
+
+@wp.func
+def times(T: wp.mat44, p: wp.vec3) -> wp.vec3:
+    """Point p moved by T."""
+    return wp.vec3(
+        T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3],
+        T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3],
+        T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3],
+    )
+
+
+@wp.kernel
+def sample_depth(
+    filtered: wp.array[wp.float32],
+    raw: wp.array[wp.float32],
+    grid: Grid,
+    depth: wp.array[wp.float32],
+    nearest: wp.array[wp.float32],
+) -> None:
+    """Filtered depth on the grid, and the smallest raw reading around each of its pixels.
+
+    Where the pixel itself has no reading it is 0: what lies there is not known.
+    """
+    b, v = wp.tid()
+    image = b * grid.live_height * grid.live_width
+    row = (b * grid.height + v) * grid.width
+    u = int(0)
+    while u < grid.width:
+        centre = image + v * grid.stride * grid.live_width + u * grid.stride
+        put(depth, row + u, fetch(filtered, centre))
+        least = fetch(raw, centre)
+        if least > 0.0:
+            y = wp.max(v - 1, 0)
+            while y <= wp.min(v + 1, grid.height - 1):
+                x = wp.max(u - 1, 0)
+                while x <= wp.min(u + 1, grid.width - 1):
+                    at = image + y * grid.stride * grid.live_width + x * grid.stride
+                    near = fetch(raw, at)
+                    least = wp.where(near > 0.0, wp.min(near, least), least)
+                    x += 1
+                y += 1
+        put(nearest, row + u, least)
+        u += 1
+
+
+@wp.kernel
+def find_appeared(
+    depth: wp.array[wp.float32],
+    past_nearest: wp.array[wp.float32],
+    past_depth: wp.array[wp.float32],
+    T_past_live: wp.array2d[wp.mat44],  # (B, PAST)
+    age: wp.array2d[wp.int32],  # (B, PAST)
+    grid: Grid,
+    found: wp.array[wp.int32],
+) -> None:
+    """Which readings are where an earlier frame saw free space, and of which that is known."""
+    b, v = wp.tid()
+    row = (b * grid.height + v) * grid.width
+    pixels = grid.height * grid.width
+    u = int(0)
+    while u < grid.width:
+        result = int(0)
+        z = fetch(depth, row + u)
+        if z > 0.0:
+            p = point(u, v, z, grid)
+            for k in range(PAST):
+                if age[b, k] != UNUSED and result < APPEARED:
+                    q = times(T_past_live[b, k], p)
+                    at = place(q, grid)
+                    if at >= 0:
+                        near = fetch(past_nearest, (b * PAST + k) * pixels + at)
+                        if near > 0.0:
+                            off = tolerance(q[2], grid)
+                            here = wp.abs(fetch(past_depth, (b * PAST + k) * pixels + at) - q[2])
+                            result |= wp.where(near > q[2] + off, KNOWN | APPEARED, KNOWN)
+                            if age[b, k] == OLD and here < off:
+                                result |= SUPPORTED
+        put(found, row + u, result)
+        u += 1
+
+
+@wp.kernel
+def find_vanished(
+    nearest: wp.array[wp.float32],
+    past_depth: wp.array[wp.float32],
+    masked: wp.array[wp.int32],  # (B * h * w), of the live frames as far as is known
+    T_live_past: wp.array2d[wp.mat44],  # (B, PAST)
+    age: wp.array2d[wp.int32],  # (B, PAST)
+    grid: Grid,
+    found: wp.array[wp.int32],
+) -> None:
+    """Mark where the live frame looks through a point of an earlier frame.
+
+    What was known to move has left its place anyway: that says nothing of what it has uncovered.
+    """
+    b, k, v = wp.tid()
+    if age[b, k] != OLD:  # since then it has gone far enough to tell
+        return
+    pixels = grid.height * grid.width
+    row = (b * PAST + k) * pixels + v * grid.width
+    u = int(0)
+    while u < grid.width:
+        moved = fetch(past_depth, row + u) < 0.0
+        z = wp.abs(fetch(past_depth, row + u))
+        if z > 0.0:
+            q = times(T_live_past[b, k], point(u, v, z, grid))
+            at = place(q, grid)
+            if at >= 0:
+                i = b * pixels + at
+                behind = fetch(nearest, i) - q[2]
+                is_through = behind > tolerance(q[2], grid) and behind < RECEDED_M
+                if is_through and (not moved or fetch(masked, i) != 0):
+                    put(found, i, fetch(found, i) | VANISHED)
+        u += 1
+
+
+@wp.kernel
+def carry_log_odds(
+    depth: wp.array[wp.float32],
+    last_depth: wp.array[wp.float32],
+    last_odds: wp.array[wp.float32],
+    T_last_live: wp.array[wp.mat44],
+    grid: Grid,
+    odds: wp.array[wp.float32],
+) -> None:
+    """Log-odds of the last frame at the live readings: from the pixel around of the next depth."""
+    b, v = wp.tid()
+    row = (b * grid.height + v) * grid.width
+    pixels = grid.height * grid.width
+    u = int(0)
+    while u < grid.width:
+        value = float(0.0)
+        z = fetch(depth, row + u)
+        if z > 0.0:
+            q = times(T_last_live[b], point(u, v, z, grid))
+            at = place(q, grid)
+            if at >= 0:
+                closest = 0.03 * q[2]
+                column = at % grid.width
+                line = at / grid.width
+                for step in range(9):
+                    k = (step + 4) % 9  # the middle first
+                    x = column + k % 3 - 1
+                    y = line + k / 3 - 1
+                    if x >= 0 and y >= 0 and x < grid.width and y < grid.height:
+                        i = b * pixels + y * grid.width + x
+                        gap = wp.abs(fetch(last_depth, i) - q[2])
+                        if gap < closest and (step == 0 or closest == 0.03 * q[2]):
+                            closest = gap
+                            value = fetch(last_odds, i)
+        put(odds, row + u, value)
+        u += 1
+
+
+@wp.kernel
+def hide(
+    T_live_model: wp.array[wp.mat44],
+    masked: wp.array[wp.int32],  # (B * h * w) of the grid
+    grid: Grid,
+    vertices: wp.array2d[wp.vec3],  # (B, pixels) of the model view
+    normals: wp.array2d[wp.vec3],
+    intensity: wp.array2d[wp.float32],
+) -> None:
+    """Leave what the masked readings lie upon out of a view of the map."""
+    b, i = wp.tid()
+    p = vertices[b, i]
+    if p[2] > 0.0:
+        at = place(times(T_live_model[b], p), grid)
+        if at >= 0 and fetch(masked, b * grid.height * grid.width + at) != 0:
+            nothing = wp.vec3(0.0, 0.0, 0.0)
+            vertices[b, i] = nothing
+            normals[b, i] = nothing
+            intensity[b, i] = 0.0
+
+
+@wp.kernel
+def enlarge(masked: wp.array[wp.int32], grid: Grid, image: wp.array[wp.int32]) -> None:
+    """The mask of the grid at the size of the live images."""
+    b, v = wp.tid()
+    half = grid.stride / 2
+    line = wp.min((v + half) / grid.stride, grid.height - 1)
+    row = (b * grid.height + line) * grid.width
+    live_row = (b * grid.live_height + v) * grid.live_width
+    u = int(0)
+    column = int(0)
+    while u < grid.live_width:
+        next_column = wp.min(grid.stride * (column + 1) - half, grid.live_width)
+        next_column = wp.where(column == grid.width - 1, grid.live_width, next_column)
+        value = fetch(masked, row + column)
+        while u < next_column:
+            put(image, live_row + u, value)
+            u += 1
+        column += 1
+
+
+Bool = NDArray[np.bool_]
+Float32 = NDArray[np.float32]
+
+
+class MotionMask(Saved):
+    """Tells which readings of the live frames of B envs belong to things that move.
+
+    This one takes the world to be still.
+
+    Attributes:
+        can_doubt: whether it ever finds anything.
+    """
+
+    can_doubt = False
+
+    def __init__(self, batch: int, intrinsics: Intrinsics, device: str) -> None:
+        self._batch, self._device = batch, device
+        self.resize(intrinsics)
+
+    def resize(self, intrinsics: Intrinsics) -> None:
+        """Go on with frames of another size; what was seen at the old one is forgotten."""
+
+    def forget(self, env: int) -> None:
+        """Forget what one env has seen."""
+
+    def expect(self, live: LiveFrame, T_world_live: Float64, is_known: Bool) -> None:
+        """Take what moved in the last frames to new ones at about ``T_world_live`` (B, 4, 4).
+
+        Where that is not known, ``is_known`` (B,), nothing is masked.
+        """
+
+    def find(self, T_world_live: Float64, is_known: Bool, strict: bool = False) -> Bool:
+        """Look for what moves in the frames, taken at poses (B, 4, 4).
+
+        If ``strict``, what no earlier frame but the last few has seen is taken for moving; in the
+        first frames, all that is near.
+
+        Returns:
+            (B,) whether so much is new in the mask that the frame should be aligned again.
+        """
+        return np.zeros(self._batch, dtype=bool)
+
+    def doubts(self) -> Bool:
+        """Where (B,) what is new in the frames is enough to lead a pose astray, were it moving."""
+        return np.zeros(self._batch, dtype=bool)
+
+    def confirm(self, where: Bool) -> None:
+        """Believe what the last ``strict`` look found, for the envs ``where`` (B,)."""
+
+    def hide(self, view: ModelView, T_world_model: Float64) -> bool:
+        """Empty a view of the maps where masked readings lie; whether there are any.
+
+        ``T_world_model`` (B, 4, 4) are the poses of the view.
+        """
+        return False
+
+    def remember(self, live: LiveFrame, T_world_live: Float64, good: Bool) -> None:
+        """Mask ``live``; take it as seen from poses (B, 4, 4), where that is ``good`` (B,)."""
+
+    def share(self) -> Float64:
+        """Share (B,) of the readings that are masked."""
+        return np.zeros(self._batch)
+
+    def mask(self, env: int) -> Bool | None:
+        """Every n-th row and column (h, w) of an env's mask; None if nothing is ever masked."""
+        return None
+
 
 INTERVAL = 4  # frames between two that are remembered
 NEW = 3  # of the earlier frames; slow things have hardly moved since

@@ -1,10 +1,17 @@
-"""Where live frames were taken: pose hypotheses aligned with the map, tried in widening circles."""
+"""Where live frames were taken: pose hypotheses aligned with the map, tried in widening circles.
+
+What is known of the cameras between frames, frames aligned with the views of their maps, and the
+searches for those that are not found near the expected pose.
+"""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, se3_log
 from ms_slam_env.slam.shared.alignment_check import (
@@ -14,20 +21,261 @@ from ms_slam_env.slam.shared.alignment_check import (
     status_on_appeal,
 )
 from ms_slam_env.slam.shared.feature_poses import FeaturePose, LastFrames
+from ms_slam_env.slam.shared.state import Stateful, check_has
 from ms_slam_env.slam.slam_backend import Float64
-from ms_slam_env.slam.surfel.acceptance import Alignment, accept_any_fit, is_nearly_accepted
-from ms_slam_env.slam.surfel.camera_states import CameraStates
-from ms_slam_env.slam.surfel.map_alignment import MapAligner
-from ms_slam_env.slam.surfel.motion_mask import MotionMask
-from ms_slam_env.slam.surfel.photometry import InvalidFrameDetector, is_leap
+from ms_slam_env.slam.surfel.acceptance import (
+    Alignment,
+    accept_any_fit,
+    acceptance_thresholds,
+    geometric_thresholds,
+    is_nearly_accepted,
+)
+from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.free_space_mask import MotionMask
+from ms_slam_env.slam.surfel.keyframe_search import Images, Relocalization, measure_consistency
+from ms_slam_env.slam.surfel.photometry import (
+    InvalidFrameDetector,
+    geometry_only,
+    is_leap,
+    next_photometry,
+    same_exposure,
+)
 from ms_slam_env.slam.surfel.pipeline import Pipeline
 from ms_slam_env.slam.surfel.pose_hypotheses import (
+    NUM_FIRST,
+    NUM_HYPOTHESES,
     UNMOVED,
+    damped,
     relocalization_hypotheses,
     tracking_hypotheses,
 )
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
-from ms_slam_env.slam.surfel.relocalization import Images, Relocalization, measure_consistency
+from ms_slam_env.slam.surfel.rendering import ModelView
+from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+
+
+class CameraStates(Stateful):
+    """What is known of the cameras of B envs between frames.
+
+    The attributes are for reading: NumPy refuses to write to them. Only the methods change what
+    they show, and only ``BatchedSurfelSlam`` calls those.
+
+    Attributes:
+        poses: (B, 4, 4) T_world_camera.
+        motions: (B, 4, 4) of the last frame, which predict the next.
+        photometry: (B,) how the live grey values relate to the map's.
+        started: (B,) whether a frame has been taken.
+        lost: (B,) frames since tracking was lost.
+        time: (B,) frames taken.
+        doubted: (B,) frames in a row whose pose is uncertain.
+    """
+
+    poses: Float64
+    motions: Float64
+    photometry: NDArray[Any]
+    started: NDArray[np.bool_]
+    lost: NDArray[np.int32]
+    time: NDArray[np.int32]
+    doubted: NDArray[np.int32]
+
+    def __init__(self, batch: int) -> None:
+        """Cameras at the identity pose that have seen nothing."""
+        identity, zeros = np.tile(np.eye(4), (batch, 1, 1)), np.zeros(batch, dtype=np.int32)
+        own: dict[str, NDArray[Any]] = {"poses": identity, "motions": identity.copy()}
+        own |= {"photometry": same_exposure(batch), "started": np.zeros(batch, dtype=bool)}
+        own |= {name: zeros.copy() for name in ("lost", "time", "doubted")}
+        self._own = own
+        for name, array in own.items():
+            shown = array.view()
+            shown.flags.writeable = False
+            setattr(self, name, shown)
+
+    def reset(self, env: int, pose: ArrayLike) -> None:
+        """Start one env anew at a pose (4, 4)."""
+        fresh = CameraStates(1)
+        for name, array in self._own.items():
+            array[env] = getattr(fresh, name)[0]
+        self._own["poses"][env] = pose
+
+    def start(self, env: int) -> None:
+        """Take note that an env has a first frame."""
+        self._own["started"][env] = True
+
+    def accept(self, env: int, alignment: Alignment, least_scale: float) -> None:
+        """Move on to where the frame was tracked."""
+        own = self._own
+        own["poses"][env] = alignment.T_world_live[env]
+        # Across a gap the motion is not one frame's.
+        motion = np.eye(4) if self.lost[env] else alignment.T_model_live[env]
+        # What a degenerate view leaves open was predicted itself: let it die away.
+        is_degenerate = alignment.statistics[env]["degenerate_directions"] > 0
+        own["motions"][env] = damped(motion) if is_degenerate else motion
+        own["lost"][env] = 0
+        own["doubted"][env] = self.doubted[env] + 1 if alignment.uncertain[env] else 0
+        own["photometry"][env] = next_photometry(
+            self.photometry[env],
+            alignment.photometry[env],
+            float(alignment.statistics[env]["term_conflict"]),
+            least_scale,
+        )
+
+    def hold(self, env: int) -> None:
+        """Stay where the frame was not tracked."""
+        self._own["motions"][env] = np.eye(4)
+        self._own["lost"][env] += 1
+        self._own["doubted"][env] = 0
+
+    def follow(self, poses: Float64, motions: Float64) -> None:
+        """Take known poses (B, 4, 4) and the motions (B, 4, 4) that led there."""
+        self._own["poses"][:], self._own["motions"][:], self._own["lost"][:] = poses, motions, 0
+
+    def move_to(self, env: int, pose: Float64) -> None:
+        """Put one env's camera at another pose (4, 4): its map has moved."""
+        self._own["poses"][env] = pose
+
+    def forget_exposure(self, env: int) -> None:
+        """Take an env's next frame to be exposed like the map."""
+        self._own["photometry"][env] = same_exposure(1)[0]
+
+    def count(self, frames: int = 1) -> None:
+        """Count frames of every env; -1 takes the last one back."""
+        self._own["time"] += frames
+
+    def set_time(self, env: int, frame: int) -> None:
+        """Give an env's next frame this number."""
+        self._own["time"][env] = frame
+
+    def get_state(self) -> dict[str, Any]:
+        """Copies of the arrays."""
+        return {name: array.copy() for name, array in self._own.items()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state."""
+        check_has(state, self._own, type(self).__name__)
+        for name, array in self._own.items():
+            array[...] = state[name]
+
+
+class MapAligner:
+    """Aligns the frames of B envs with their maps, and keeps the view of the map that it used."""
+
+    def __init__(
+        self, states: CameraStates, surfel_map: SurfelMap, motion_mask: MotionMask
+    ) -> None:
+        self._states = states
+        self._map = surfel_map
+        self._motion_mask = motion_mask
+        self._device_poses = HostDeviceBuffer(surfel_map.batch, wp.mat44, surfel_map.device)
+        self._strict = np.ones(surfel_map.batch, dtype=bool)
+        self._view: ModelView
+        self._view_poses: Float64 | None = None  # of ``_view``; None: the maps have changed since
+
+    def use(self, pipeline: Pipeline) -> None:
+        """Look at frames in this way from now on."""
+        self._tracker = pipeline.tracker
+        self._config = pipeline.config
+        self.forget_view()
+
+    def forget_view(self) -> None:
+        """Render anew next time: the maps have changed, or what of them takes part."""
+        self._view_poses = None
+
+    def render(self, poses: Float64) -> ModelView:
+        """Render the maps from ``poses`` (B, 4, 4), unless that view is at hand."""
+        if self._view_poses is None or not np.array_equal(self._view_poses, poses):
+            self._device_poses.write(poses)
+            self._view = self._map.render_model(self._device_poses.array)
+            self._view_poses = poses.copy()
+        return self._view
+
+    def set_frame(self, live: LiveFrame) -> None:
+        """Take the frames that ``align_from`` aligns next."""
+        self._tracker.set_frame(live)
+
+    def align_from(
+        self, origins: Float64, hypotheses: Float64, thresholds: NDArray[Any]
+    ) -> Alignment:
+        """Align the current frames with the maps as seen from ``origins`` (B, 4, 4)."""
+        return self._align(origins, hypotheses, thresholds, self._states.photometry)
+
+    def align_strictly(self, origins: Float64, hypotheses: Float64) -> Alignment:
+        """The same under strict thresholds, of alignments that a wide search leads to."""
+        config, lost = self._config.acceptance, self._states.lost
+        return self.align_from(
+            origins, hypotheses, acceptance_thresholds(config, self._strict, lost)
+        )
+
+    def track(self, invalid: NDArray[np.bool_], guesses: Float64 | None) -> Alignment:
+        """Align with the views from the last poses; a lost env searches wider at every frame."""
+        states = self._states
+        lost = states.lost > 0
+        hypotheses = np.stack(
+            [
+                relocalization_hypotheses(int(frames_lost) - 1)
+                if frames_lost
+                else tracking_hypotheses(motion)
+                for motion, frames_lost in zip(states.motions, states.lost, strict=True)
+            ]
+        )
+        thresholds = acceptance_thresholds(self._config.acceptance, lost, states.lost)
+        alignment = self._align(states.poses, hypotheses, thresholds, states.photometry, guesses)
+        alignment = alignment.with_status(invalid, TrackingStatus.BLANK)
+        return self._without_color(hypotheses, alignment)
+
+    def refine(self, starts: Float64) -> Alignment:
+        """Align with the views from the last poses at the finest level alone.
+
+        ``starts`` (B, 4, 4) are T_model_live.
+        """
+        states = self._states
+        thresholds = acceptance_thresholds(self._config.acceptance, states.lost > 0, states.lost)
+        view = self._view_from(states.poses)
+        return self._tracker.refine(view, states.poses, starts, thresholds, states.photometry)
+
+    def _without_color(self, hypotheses: Float64, alignment: Alignment) -> Alignment:
+        """Align the envs whose grey values do not fit by geometry alone, from the nearest poses.
+
+        Lights are switched, cameras glare, and a recording's colour may not be registered with its
+        depth. Geometry must then constrain the pose without help, near to where it is expected.
+        """
+        states = self._states
+        failed = states.started & (alignment.status == TrackingStatus.PHOTOMETRIC_MISMATCH)
+        if not failed.any():
+            return alignment
+        near = np.repeat(hypotheses[:, :1], NUM_HYPOTHESES, axis=1)
+        near[:, :NUM_FIRST] = hypotheses[:, :NUM_FIRST]
+        thresholds = geometric_thresholds(self._config.acceptance, states.lost)
+        again = self._align(states.poses, near, thresholds, geometry_only(states.photometry))
+        return alignment.replace(failed & again.tracked, again)
+
+    def realign(self, live: LiveFrame, alignment: Alignment, where: NDArray[np.bool_]) -> Alignment:
+        """Align the envs ``where`` (B,) again from where they were found, with other images."""
+        self._tracker.set_frame(live)
+        states = self._states
+        starts = np.where(where[:, None, None], alignment.T_model_live, np.eye(4))
+        hypotheses = np.repeat(starts[:, None], NUM_HYPOTHESES, axis=1)
+        thresholds = acceptance_thresholds(self._config.acceptance, states.lost > 0, states.lost)
+        again = self.align_from(states.poses, hypotheses, thresholds)
+        return alignment.replace(where & again.tracked, again)
+
+    def _align(
+        self,
+        origins: Float64,
+        hypotheses: Float64,
+        thresholds: NDArray[Any],
+        photometry: NDArray[Any],
+        guesses: Float64 | None = None,
+    ) -> Alignment:
+        view = self._view_from(origins)
+        return self._tracker.align(view, origins, hypotheses, thresholds, guesses, photometry)
+
+    def _view_from(self, origins: Float64) -> ModelView:
+        """The maps from ``origins`` (B, 4, 4), but what moves."""
+        view = self.render(origins)
+        if self._motion_mask.hide(view, origins):
+            self.forget_view()  # it is whole no more
+        return view
+
 
 MOSTLY_MOVING = 0.6  # share of the readings: rather the pose is wrong, or too little is left
 CLEARLY_APART = 30.0  # squared Mahalanobis distance; below 20 where nothing leads a pose
@@ -36,6 +284,7 @@ MENDED = 0.9  # of the cost of an alignment that may have slipped
 # Of the cost of one that left a direction open, in which it is no judge: of 36 such frames of
 # validation seeds for which features led to an alignment it takes 34, 30 nearer, 2 farther.
 AS_GOOD = 1.5
+LONGEST_DOUBT = 10  # frames in a row that may be uncertain; after them tracking is lost
 RETRIES = 2  # further searches within a frame whose tracking failed
 
 
@@ -226,11 +475,11 @@ class Localizer:
 
         One that the thresholds accept is at worst uncertain.
         """
-        status, longest = status_on_appeal(found), self._config.acceptance.doubted.longest
+        status = status_on_appeal(found)
         if not was_refused:
             is_refuted = status == TrackingStatus.PHOTOMETRIC_MISMATCH
             status = TrackingStatus.UNCERTAIN if is_refuted else TrackingStatus.OK
-        is_over = status == TrackingStatus.UNCERTAIN and self._states.doubted[env] >= longest
+        is_over = status == TrackingStatus.UNCERTAIN and self._states.doubted[env] >= LONGEST_DOUBT
         return TrackingStatus.PHOTOMETRIC_MISMATCH if is_over else status
 
     def _search_by_features(self, alignment: Alignment, frames: Images) -> Alignment:
@@ -254,8 +503,7 @@ class Localizer:
         alignment = alignment.replace(taken, again.seen_from(states.poses))
         alone = np.zeros(len(origins), dtype=bool)
         for env in np.flatnonzero(self._failed(alignment) & ~alignment.uncertain & where):
-            longest = self._config.acceptance.doubted.longest
-            may_doubt = states.lost[env] == 0 and states.doubted[env] < longest
+            may_doubt = states.lost[env] == 0 and states.doubted[env] < LONGEST_DOUBT
             alone[env] = may_doubt and found[int(env)].is_strong
         there = again.doubtful_at(origins, states.photometry)
         return alignment.replace(alone, there.seen_from(states.poses))

@@ -3,13 +3,13 @@
 ElasticFusion (Whelan et al., RSS 2015, sections IV to VI). Surfels not seen for ``window`` frames
 are inactive: frames are neither tracked against them nor fused into them. Every few frames
 
-- local: where the inactive part is in view, the live frame is registered with it as it was with
+- local: where the inactive part is in view, the live frame is aligned with it as it was with
   the active part before; both poses differ by the drift since;
 - global: where that gave nothing, keyframes that resemble the frame say where else in the inactive
-  part it may be, and it is registered there.
+  part it may be, and it is aligned there.
 
-If the registration is good, the deformation graph takes the active part there while it holds the
-inactive one, and what is in view becomes one surface, active again. The paper registers the active
+If the alignment is good, the deformation graph takes the active part there while it holds the
+inactive one, and what is in view becomes one surface, active again. The paper aligns the active
 part's rendering in place of the live frame; the frame has no holes, and its noise is common to
 both poses.
 
@@ -54,6 +54,8 @@ Bool = NDArray[np.bool_]
 
 SimilarViews = Callable[[int, int], list[Candidate]]
 """Keyframes of an env, taken before a frame, that resemble the one just tracked, best first."""
+ClosedLoop = tuple[Loop, Float64]
+"""A loop, and the camera's pose (4, 4) after it was closed."""
 
 
 class LoopClosure(Saved):
@@ -81,10 +83,10 @@ class LoopClosure(Saved):
 
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
-    ) -> Mapping[int, Loop]:
+    ) -> Mapping[int, ClosedLoop]:
         """Look for loops after the frames ``time`` (B,) were recorded; those closed, by env.
 
-        Maps and ``poses`` (B, 4, 4) are corrected in place.
+        Maps are corrected in place; ``poses`` (B, 4, 4) stay as they are.
         """
         return {}
 
@@ -103,11 +105,16 @@ class LoopClosure(Saved):
         """Remember this of one env."""
 
 
-SETTLED = 0.02, np.radians(2.0)  # largest motion of a repeated registration
+LARGEST_SIGMA = 0.01  # standard deviation (metres, radians) of an alignment's worst direction
+LEAST_INLIERS = 0.7  # share of matched points that an alignment explains
+LARGEST_DEG = 20.0  # correction of the camera's rotation that is believed
+LARGEST_DISSIMILARITY = 0.3  # of a frame and a keyframe of the same place, share of the ferns
+AGREEMENT_M = 0.01  # a loop is closed when two looks agree so far on the correction, at 1 m
+SETTLED = 0.02, np.radians(2.0)  # largest motion of a repeated alignment
 
 
-class InactiveRegistration:
-    """Registers the frames of B envs with the inactive part of their maps."""
+class InactiveAligner:
+    """Aligns the frames of B envs with the inactive part of their maps."""
 
     def __init__(
         self, surfel_map: SurfelMap, inactive: SplatRenderer, config: SurfelConfig, device: str
@@ -122,7 +129,7 @@ class InactiveRegistration:
         self._poses = HostDeviceBuffer(self.batch, wp.mat44, device)
 
     def set_frame(self, live: LiveFrame) -> None:
-        """Take the frames that are registered next."""
+        """Take the frames that are aligned next."""
         self._tracker.set_frame(live)
 
     def covered(self, poses: Float64, due: Bool) -> Bool:
@@ -142,11 +149,11 @@ class InactiveRegistration:
         return due & (shares >= self.config.coverage)
 
     def near(self, poses: Float64) -> Alignment:
-        """Register with the view that ``covered`` rendered from ``poses``."""
+        """Align with the view that ``covered`` rendered from ``poses``."""
         return self._align(poses, tracking_hypotheses(np.eye(4)), self.config.largest_m)
 
     def from_keyframes(self, starts: Float64) -> Alignment | None:
-        """Register from poses (B, 4, 4) that are rough and may be wrong, NaN for an env without.
+        """Align from poses (B, 4, 4) that are rough and may be wrong, NaN for an env without.
 
         What is found must be found again from there; None if nothing was.
         """
@@ -171,14 +178,14 @@ class InactiveRegistration:
         stack = np.tile(hypotheses, (self.batch, 1, 1, 1))
         strict, lost = np.ones(self.batch, dtype=bool), np.zeros(self.batch, dtype=np.int32)
         thresholds = acceptance_thresholds(self._acceptance, strict, lost)
-        thresholds["sigma_m"] = self.config.sigma
-        thresholds["inlier_ratio"] = self.config.inliers
+        thresholds["sigma_m"] = LARGEST_SIGMA
+        thresholds["inlier_ratio"] = LEAST_INLIERS
         thresholds["motion_m"] = largest_m
-        thresholds["rotation_cos"] = np.cos(np.radians(self.config.largest_deg))
+        thresholds["rotation_cos"] = np.cos(np.radians(LARGEST_DEG))
         return self._tracker.align(self._inactive.view, origins, stack, thresholds)
 
 
-SIGNIFICANT = 3.0  # drift, in standard deviations of the registration, that is worth deforming for
+SIGNIFICANT = 3.0  # drift, in standard deviations of the alignment, that is worth deforming for
 VIEW_APART_M, VIEW_APART_RAD = 1.0, np.radians(60.0)  # views of one place differ by less
 
 
@@ -195,7 +202,7 @@ class DeformationLoopClosure(LoopClosure):
         self._window = any_time(self.batch, device)  # of the inactive surfels
         inactive = surfel_map.model_renderer(stride, self._window)
         active = surfel_map.model_renderer(stride, surfel_map.active)
-        self._registration = InactiveRegistration(surfel_map, inactive, config, device)
+        self._aligner = InactiveAligner(surfel_map, inactive, config, device)
         self._deformer = MapDeformer(surfel_map, inactive, active, config, device)
         self._seen_from = np.full(self.batch, EARLIEST, dtype=np.int32)
         self._histories = [TrajectoryHistory() for _ in range(self.batch)]
@@ -221,17 +228,17 @@ class DeformationLoopClosure(LoopClosure):
 
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
-    ) -> Mapping[int, Loop]:
+    ) -> Mapping[int, ClosedLoop]:
         """Look for loops where it is time to, and close them; see the base class."""
-        found: dict[int, Loop | None] = {}
+        found: dict[int, ClosedLoop | None] = {}
         due = tracked & (time > self.config.window) & (time % self.config.interval == 0)
         if not due.any():
             return {}
         self._window.seen_to.assign(time - self.config.window - 1)
-        self._registration.set_frame(live)
-        near = self._registration.covered(poses, due)
+        self._aligner.set_frame(live)
+        near = self._aligner.covered(poses, due)
         if near.any():
-            there = self._registration.near(poses)
+            there = self._aligner.near(poses)
             for env in np.flatnonzero(near & there.tracked):
                 found[int(env)] = self._close(int(env), poses, there)
                 due[env] = False
@@ -240,11 +247,13 @@ class DeformationLoopClosure(LoopClosure):
             found[int(env)] = self._close_from_keyframes(int(env), poses, similar)
         return {env: loop for env, loop in found.items() if loop is not None}
 
-    def _close_from_keyframes(self, env: int, poses: Float64, similar: SimilarViews) -> Loop | None:
+    def _close_from_keyframes(
+        self, env: int, poses: Float64, similar: SimilarViews
+    ) -> ClosedLoop | None:
         """Look for the frame where similar ones were taken, and close a loop there."""
         history = self._histories[env]
         for candidate in similar(env, history.last - self.config.window):
-            if candidate.dissimilarity > self.config.dissimilarity:
+            if candidate.dissimilarity > LARGEST_DISSIMILARITY:
                 break
             allowed_m = self.config.drift_share * history.path_m(candidate.time)
             apart = VIEW_APART_M + allowed_m, VIEW_APART_RAD
@@ -252,7 +261,7 @@ class DeformationLoopClosure(LoopClosure):
                 continue
             starts = np.full((self.batch, 4, 4), np.nan)
             starts[env] = candidate.T_world_camera
-            there = self._registration.from_keyframes(starts)
+            there = self._aligner.from_keyframes(starts)
             if there is None:
                 continue
             drift = np.linalg.norm(there.T_world_live[env, :3, 3] - poses[env, :3, 3])
@@ -260,16 +269,16 @@ class DeformationLoopClosure(LoopClosure):
                 return self._close(env, poses, there)
         return None
 
-    def _close(self, env: int, poses: Float64, there: Alignment) -> Loop | None:
-        """Deform map, pose and history of one env; returns the loop if it was accepted."""
+    def _close(self, env: int, poses: Float64, there: Alignment) -> ClosedLoop | None:
+        """Deform map and history of one env; the loop and where the camera is, if accepted."""
         history, corrected = self._histories[env], there.T_world_live[env]
         loop = history.loop_at(corrected, history.last - self.config.window)
         drift = motion_size(invert(poses[env]) @ corrected)
         if drift < self.config.smallest_m:
             self._deformer.join_parts(env, poses[env], history.last)
-            return replace(loop, bent=False)
+            return replace(loop, bent=False), poses[env]
         if drift < SIGNIFICANT * there.statistics["sigma_m"][env] or not history.confirms(
-            poses[env], corrected, self.config.agreement_m, 2 * self.config.global_interval
+            poses[env], corrected, AGREEMENT_M, 2 * self.config.global_interval
         ):
             return None
         deformed = self._deformer.deform(env, poses[env], corrected, history.joined)
@@ -277,9 +286,8 @@ class DeformationLoopClosure(LoopClosure):
             return None
         deformation, joined = deformed
         history.move(deformation, joined, corrected)
-        poses[env] = corrected
         self._deformer.join_parts(env, corrected, history.last)
-        return loop
+        return loop, corrected
 
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
         """Tracked frames (N,) and their poses (N, 4, 4), moved by the closures since."""

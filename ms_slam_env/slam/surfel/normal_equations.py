@@ -16,7 +16,7 @@ With the right perturbation T <- T exp(xi), xi = (rho, phi):
 Residuals are divided by their standard deviations, which makes both terms free of units:
 
     s_icp = depth_noise_m z^2                        axial noise of the sensor
-    s_rgb^2 = intensity_noise^2 + (lateral_noise_px |grad I|)^2
+    s_rgb^2 = intensity_noise^2 + (LATERAL_NOISE_PX |grad I|)^2
 
 The second part of s_rgb is the error of the place in the image where the grey value was sampled
 (aliasing, depth, pose of the map). Without it strong edges, the best features, look like outliers.
@@ -45,16 +45,101 @@ compiler turns into operations on eight points. A thread of a GPU takes one poin
 
 from __future__ import annotations
 
-from ms_slam_env._runtime.warp import wp
+from enum import IntEnum
+
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
-from ms_slam_env.slam.surfel.alignment_arrays import (
-    RUNNING,
-    AlignedImages,
-    Hypotheses,
-    Photometry,
-    Sum,
-    Weights,
-)
+
+
+class Sum(IntEnum):
+    """Places of a pass's sums; H takes 21 (upper triangle by rows), g = J^T W r six."""
+
+    GEOMETRIC_HESSIAN = 0
+    GEOMETRIC_GRADIENT = 21
+    COST = 27  # truncated robust cost of the visible points, in [0, 3] each
+    POINTS = 28  # model points looked at
+    VISIBLE = 29  # of those, inside the live image
+    MATCHED = 30  # of those, with a live vertex
+    INLIERS = 31  # of those, within the gates and a few sigmas of the model's plane
+    SQUARED_M2 = 32  # squared point-to-plane residuals of the inliers, m^2
+    TEXTURED = 33  # visible, with a marked intensity gradient
+    PHOTOMETRIC_INLIERS = 34  # of those, with a small photometric residual
+    DEPTH_CONFLICTS = 35  # matched, but the live surface is clearly nearer or farther
+    EXPOSURE_W = 36  # exposed points: robust weight w
+    EXPOSURE_WM = 37  # w m, with m = I_p - 128
+    EXPOSURE_WMM = 38
+    EXPOSURE_WR = 39  # w r, with r the photometric residual
+    EXPOSURE_WMR = 40
+    ROUGH = 41  # of the textured: 1 - robust weight; half their number at the right scale
+    PHOTOMETRIC_HESSIAN = 42
+    PHOTOMETRIC_GRADIENT = 63
+    TILTED = 69  # geometric weights times 1 - cosine of the angle between the normals
+    EXPOSURE_WRR = 70
+
+
+NUM_SUMS = 71
+
+OFF = wp.constant(0)  # states of a hypothesis, in ``active``: takes no part
+RUNNING = wp.constant(1)
+RESTING = wp.constant(2)  # converged at its level, wakes at the next
+
+
+@wp.struct
+class Weights:
+    """Scales of the residuals; see ``normal_equations``. Reciprocals save divisions per pixel."""
+
+    icp: float
+    rgb: float
+    per_depth_noise: float  # 1 / depth_noise_m
+    per_cauchy_icp: float  # 1 / sigmas
+    per_cauchy_rgb: float  # 1 / sigmas
+    grey_variance: float  # of the intensity, grey levels^2
+    pixel_variance: float  # of the place in the image, pixels^2
+    distance_m: float
+    cos_angle: float
+    inlier_sigmas: float  # these four as in ``AcceptanceConfig``
+    conflict_sigmas: float
+    texture: float
+    photometric_inlier: float
+    least_scale: float  # least c of photometric residuals, in sigmas
+
+
+@wp.struct
+class Photometry:
+    """How the live grey values relate to the model's: I_live ~ gain I_model + bias."""
+
+    gain: float
+    bias: float  # grey levels
+    scale: float  # c of the photometric loss, in sigmas: half of all textured residuals exceed it
+    reference: float  # the same as it usually is, over its least value; the unit of the acceptance
+    trust: float  # weight of the photometric term, [0, 1]
+
+
+@wp.struct
+class Hypotheses:
+    """K pose hypotheses of B envs."""
+
+    pose: wp.array2d[wp.mat44d]  # (B, K) T_model_live
+    photometry: wp.array2d[Photometry]  # (B, K)
+    state: wp.array2d[wp.int32]  # (B, K) OFF, RUNNING or RESTING
+    partial: wp.array4d[wp.float32]  # (B, K, rows * pieces, NUM_SUMS) of the parts of a pass
+    sums: wp.array3d[wp.float64]  # (B, K, NUM_SUMS) of the last pass, see ``Sum``
+
+
+@wp.struct
+class AlignedImages:
+    """Images of B envs at one pyramid level, flat, and the camera of the live ones."""
+
+    model_vertices: wp.array[wp.vec3]
+    model_normals: wp.array[wp.vec3]
+    model_intensity: wp.array[wp.float32]
+    live_vertices: wp.array[wp.vec3]
+    live_normals: wp.array[wp.vec3]
+    live_gradient: wp.array[wp.vec3]  # (I, dI/du, dI/dv)
+    model_size: wp.vec2i  # (width, height); ``live_size`` likewise
+    live_size: wp.vec2i
+    focal: wp.vec2  # (fx, fy)
+    centre: wp.vec2  # (cx, cy)
 
 
 @wp.func_native(
@@ -74,9 +159,9 @@ def accumulate_points(
     t: wp.vec3,
     weights: Weights,
     photometry: Photometry,
-    partial: wp.array4d(dtype=wp.float32),
+    partial: wp.array4d[wp.float32],
     row: int,
-):
+) -> None:
     """Sum the terms of the model points from ``start`` to ``end`` into a row of ``partial``.
 
     ``R`` and ``t`` are T_live_model.
@@ -94,7 +179,7 @@ def accumulate_row(
     k: int,
     row_index: int,
     piece: int,
-):
+) -> None:
     """Sum the terms of one piece of a row of model points for hypothesis k of env b."""
     width = images.model_size[0]
     T = hypotheses.pose[b, k]
@@ -128,7 +213,7 @@ def accumulate_row(
 @wp.kernel
 def accumulate_normal_equations(
     images: AlignedImages, weights: Weights, stride: int, columns: int, hypotheses: Hypotheses
-):
+) -> None:
     """Sum the terms of one piece of a row of model points, for every active hypothesis."""
     b, k, row_index, piece = wp.tid()
     if hypotheses.state[b, k] == RUNNING:

@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.shared.state import Saved
-from ms_slam_env.slam.surfel.alignment_arrays import Photometry
 from ms_slam_env.slam.surfel.device import (
     HostDeviceBuffer,
     KernelLaunchCache,
@@ -24,6 +23,7 @@ from ms_slam_env.slam.surfel.device import (
     put,
     threads_per_row,
 )
+from ms_slam_env.slam.surfel.normal_equations import Photometry
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 
 Bool = NDArray[np.bool_]
@@ -103,13 +103,13 @@ def _shrink(values: NDArray[np.float64], threshold: float) -> NDArray[np.float64
 
 @wp.kernel
 def _correct(
-    per_gain: wp.array(dtype=wp.float32),  # (B,)
-    bias: wp.array(dtype=wp.float32),
+    per_gain: wp.array[wp.float32],  # (B,)
+    bias: wp.array[wp.float32],
     height: wp.int32,
     width: wp.int32,
     columns: wp.int32,  # per thread
-    color: wp.array(dtype=wp.vec3),
-):
+    color: wp.array[wp.vec3],
+) -> None:
     """(colour - bias) / gain, in [0, 255]."""
     row, piece = wp.tid()
     b = row / height

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, make_pose, relative_angle, se3_exp, se3_log, so3_exp
 from ms_slam_env.slam.slam_backend import Float64
-from ms_slam_env.slam.surfel.alignment_arrays import OFF, RUNNING, Hypotheses, Sum
+from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Hypotheses, Sum
 
 NUM_HYPOTHESES = 8
 AT_REST, CONSTANT_VELOCITY, INITIAL_GUESS = (wp.constant(i) for i in range(3))
@@ -118,7 +118,7 @@ def check_guesses(guesses: Sequence[ArrayLike | None] | None, batch: int) -> Flo
 
 
 @wp.func
-def _score(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
+def _score(sums: wp.array3d[wp.float64], b: int, k: int) -> wp.float64:
     """Mean truncated cost per model point; a point out of view costs a fixed share."""
     points = sums[b, k, Sum.POINTS]
     visible = sums[b, k, Sum.VISIBLE]
@@ -128,7 +128,7 @@ def _score(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
 
 
 @wp.kernel
-def expand_hypotheses(first: Hypotheses, more: Hypotheses, good_score: wp.float64):
+def expand_hypotheses(first: Hypotheses, more: Hypotheses, good_score: wp.float64) -> None:
     """Switch on the further hypotheses (B, K2) unless one of the first (B, K1) fits well."""
     b = wp.tid()
     best = wp.float64(1.0e9)
@@ -145,7 +145,7 @@ def expand_hypotheses(first: Hypotheses, more: Hypotheses, good_score: wp.float6
 
 
 @wp.kernel
-def select_hypothesis(first: Hypotheses, more: Hypotheses, one: Hypotheses):
+def select_hypothesis(first: Hypotheses, more: Hypotheses, one: Hypotheses) -> None:
     """Go on with the hypothesis whose points fit best; it becomes the only one, (B, 1)."""
     b = wp.tid()
     # Where the view leaves directions open all starts fit alike: prefer what is predicted.

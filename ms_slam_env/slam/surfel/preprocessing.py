@@ -4,21 +4,32 @@ ElasticFusion (Whelan et al., RSS 2015) section III: depth is filtered bilateral
 filter runs along columns, then rows (Pham and van Vliet, ICME 2005), and on inverse depth, because
 the inverse depth of a plane is linear in the image (so a symmetric window keeps planes) and the
 noise of a structured-light sensor is uniform in it.
+
+In the coarser levels of vertices, normals and intensity invalid pixels leave no trace. Averaging
+over an invalid pixel, or over a depth edge, makes points and grey values that exist nowhere; they
+break tracking at the coarse levels. A coarse pixel is the mean of those pixels of its 2x2 block
+that are valid and lie near the front-most of them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer, fetch, put, threads_per_row
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
+SIGMA_PX = 1.5  # width of the bilateral depth filter in the image
 FLATTEST = wp.constant(5.67)  # tangent of 80 degrees, of the view onto a plane close by
 
 
@@ -38,15 +49,15 @@ class LiveFrame:
 
 @wp.kernel
 def _convert(
-    raw_depth: wp.array(dtype=wp.float32),
-    raw_color: wp.array(dtype=wp.uint8),
+    raw_depth: wp.array[wp.float32],
+    raw_color: wp.array[wp.uint8],
     cutoff_m: wp.float32,
     width: wp.int32,
     columns: wp.int32,  # per thread
-    inverse_depth: wp.array(dtype=wp.float32),
-    color: wp.array(dtype=wp.vec3),
-    intensity: wp.array(dtype=wp.float32),
-):
+    inverse_depth: wp.array[wp.float32],
+    color: wp.array[wp.vec3],
+    intensity: wp.array[wp.float32],
+) -> None:
     """Inverse depth (0 for no reading or one beyond the cutoff), colour and its BT.601 luma."""
     row, piece = wp.tid()
     i = row * width + piece * columns
@@ -65,17 +76,17 @@ def _convert(
 
 @wp.kernel
 def _filter(
-    inverse_depth: wp.array(dtype=wp.float32),
+    inverse_depth: wp.array[wp.float32],
     height: wp.int32,
     width: wp.int32,
     columns: wp.int32,
     along_rows: wp.int32,  # 1: neighbours are in the same row; 0: in the same column
-    spatial_weights: wp.array(dtype=wp.float32),  # (radius + 1,)
+    spatial_weights: wp.array[wp.float32],  # (radius + 1,)
     per_cutoff_squared: wp.float32,  # 1 / (difference of inverse depth that weighs nothing)^2
-    weights: wp.array(dtype=wp.float32),  # working memory, per pixel
-    shifts: wp.array(dtype=wp.float32),
-    filtered: wp.array(dtype=wp.float32),
-):
+    weights: wp.array[wp.float32],  # working memory, per pixel
+    shifts: wp.array[wp.float32],
+    filtered: wp.array[wp.float32],
+) -> None:
     """Bilateral filter along the rows or the columns of the image.
 
     The loop over neighbours is outside, the one over pixels inside and without branches: the
@@ -123,7 +134,7 @@ def _filter(
 
 
 @wp.func
-def _slope(before: float, here: float, after: float, largest: float, steepest: float):
+def _slope(before: float, here: float, after: float, largest: float, steepest: float) -> wp.vec2:
     """Difference per step of inverse depth to valid neighbours; (slope, 1), or (0, 0) if none.
 
     Inputs are inverse depths, 0 where invalid. A side that jumps by more than ``largest`` is an
@@ -152,7 +163,7 @@ def _normal(
     largest: float,
     ray: wp.vec2,
     focal_per_step: wp.vec2,
-):
+) -> wp.vec3:
     """Unit normal of a pixel from its inverse depth and its neighbours'; 0 where invalid."""
     slope_u = _slope(left, inverse, right, largest, FLATTEST / focal_per_step[0])
     slope_v = _slope(above, inverse, below, largest, FLATTEST / focal_per_step[1])
@@ -168,7 +179,7 @@ def _normal(
 
 @wp.kernel
 def _surface(
-    inverse_depth: wp.array(dtype=wp.float32),
+    inverse_depth: wp.array[wp.float32],
     height: wp.int32,
     width: wp.int32,
     columns: wp.int32,
@@ -176,10 +187,10 @@ def _surface(
     largest: wp.float32,
     focal: wp.vec2,
     centre: wp.vec2,
-    depth: wp.array(dtype=wp.float32),
-    vertices: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-):
+    depth: wp.array[wp.float32],
+    vertices: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+) -> None:
     """Depth, vertices and normals of filtered inverse depth."""
     row, piece = wp.tid()
     v = row % height
@@ -252,7 +263,7 @@ class Preprocessor:
             wp.zeros_like(self._inverse_depth) for _ in range(3)
         )
         offsets = np.arange(config.bilateral_radius_px + 1, dtype=np.float32)
-        weights = np.exp(-(offsets**2) / (2 * config.bilateral_sigma_px**2))
+        weights = np.exp(-(offsets**2) / (2 * SIGMA_PX**2))
         self._spatial_weights = wp.array(weights, dtype=wp.float32, device=device)
         # A finer image has noisier slopes over one pixel; keep the baseline of 160 columns.
         self._normal_step = max(1, intrinsics.width // 160)
@@ -304,3 +315,248 @@ def check_images(
         )
     if not (depth.min() >= 0 and depth.max() < np.inf):
         raise InputError("depth holds NaN, infinite or negative values; 0 means no reading")
+
+
+EDGE_FRACTION = 0.03  # pixels of a block further behind the front one than this are another surface
+
+
+@wp.func
+def _share(p: wp.vec3, limit: float) -> float:
+    """1 for a valid pixel that is not behind the limit, else 0."""
+    return wp.where(p[2] > 0.0 and p[2] <= limit, 1.0, 0.0)
+
+
+@wp.func
+def _distance(p: wp.vec3) -> float:
+    """Depth of a pixel; very far where invalid."""
+    return wp.where(p[2] > 0.0, p[2], 1.0e9)
+
+
+@wp.kernel
+def _downsample(
+    vertices: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    intensity: wp.array[wp.float32],
+    height: wp.int32,  # of the fine image
+    width: wp.int32,
+    edge_fraction: wp.float32,
+    columns: wp.int32,  # of the coarse image, per thread
+    coarse_vertices: wp.array[wp.vec3],
+    coarse_normals: wp.array[wp.vec3],
+    coarse_intensity: wp.array[wp.float32],
+) -> None:
+    row, piece = wp.tid()
+    coarse_height = height / 2
+    coarse_width = width / 2
+    b = row / coarse_height
+    u = piece * columns
+    end = wp.min(u + columns, coarse_width)
+    i = row * coarse_width + u  # in the coarse image
+    j = (b * height + 2 * (row - b * coarse_height)) * width + 2 * u  # in the fine one
+    while u < end:
+        p00 = fetch(vertices, j)
+        p01 = fetch(vertices, j + 1)
+        p10 = fetch(vertices, j + width)
+        p11 = fetch(vertices, j + width + 1)
+        front = wp.min(
+            wp.min(_distance(p00), _distance(p01)), wp.min(_distance(p10), _distance(p11))
+        )
+        limit = front * (1.0 + edge_fraction)
+        s00 = _share(p00, limit)
+        s01 = _share(p01, limit)
+        s10 = _share(p10, limit)
+        s11 = _share(p11, limit)
+        normal = s00 * fetch(normals, j) + s01 * fetch(normals, j + 1)
+        normal += s10 * fetch(normals, j + width) + s11 * fetch(normals, j + width + 1)
+        i00 = fetch(intensity, j)
+        i01 = fetch(intensity, j + 1)
+        i10 = fetch(intensity, j + width)
+        i11 = fetch(intensity, j + width + 1)
+        count = s00 + s01 + s10 + s11
+        per_count = 1.0 / wp.max(count, 1.0)
+        grey = (s00 * i00 + s01 * i01 + s10 * i10 + s11 * i11) * per_count
+        squared = wp.dot(normal, normal)
+        has_normal = squared > 0.0
+        scale = wp.where(has_normal, 1.0 / wp.sqrt(wp.where(has_normal, squared, 1.0)), 0.0)
+        put(coarse_vertices, i, (s00 * p00 + s01 * p01 + s10 * p10 + s11 * p11) * per_count)
+        put(coarse_normals, i, scale * normal)
+        # The sensor's grey value is good where its depth is missing.
+        mean = 0.25 * (i00 + i01 + i10 + i11)
+        put(coarse_intensity, i, wp.where(count > 0.0, grey, mean))
+        u += 1
+        i += 1
+        j += 2
+
+
+@wp.kernel
+def _intensity_gradient(
+    intensity: wp.array[wp.float32],
+    height: wp.int32,
+    width: wp.int32,
+    columns: wp.int32,
+    gradient: wp.array[wp.vec3],
+) -> None:
+    """Write (intensity, d/du, d/dv) by central differences, one-sided at the border."""
+    row, piece = wp.tid()
+    v = row % height
+    to_above = wp.where(v > 0, -width, 0)
+    to_below = wp.where(v < height - 1, width, 0)
+    per_height = wp.where(v > 0 and v < height - 1, 0.5, 1.0)
+    start = row * width
+    first = start + piece * columns
+    last = start + wp.min((piece + 1) * columns, width)
+    for part in range(3):  # the left border, the columns inside, the right border
+        i = wp.max(first, start + wp.where(part == 0, 0, wp.where(part == 1, 1, width - 1)))
+        end = start + wp.where(part == 0, 1, wp.where(part == 1, width - 1, width))
+        end = wp.min(last, end)
+        to_left = wp.where(part == 0, 0, -1)
+        to_right = wp.where(part == 2, 0, 1)
+        per_width = wp.where(part == 1, 0.5, 1.0)
+        while i < end:
+            slope_u = (fetch(intensity, i + to_right) - fetch(intensity, i + to_left)) * per_width
+            slope_v = (fetch(intensity, i + to_below) - fetch(intensity, i + to_above)) * per_height
+            put(gradient, i, wp.vec3(fetch(intensity, i), slope_u, slope_v))
+            i += 1
+
+
+@dataclass(frozen=True)
+class Level:
+    """One pyramid level; arrays (B, h, w). ``gradient`` holds (I, dI/du, dI/dv), or nothing."""
+
+    vertices: wp.array
+    normals: wp.array
+    intensity: wp.array
+    gradient: wp.array
+
+
+class Pyramid:
+    """Buffers of the coarse levels; level 0 is the caller's own images."""
+
+    def __init__(
+        self,
+        batch: int,
+        shapes: Sequence[tuple[int, int]],
+        with_gradient: bool,
+        device: str = "cpu",
+    ) -> None:
+        """Allocate for images of ``shapes`` (height, width), finest first.
+
+        Raises:
+            ValueError: a level is not half of the one before it, rounded down.
+        """
+        if any(coarse != (h // 2, w // 2) for (h, w), coarse in pairwise(shapes)):
+            raise ValueError(f"levels must halve, rounded down: {list(shapes)}")
+        self._device = device
+        self._columns, _ = threads_per_row(shapes[0][1], device)
+        self._launches: list[RecordedLaunch] = []
+        self._levels: list[Level] = []
+
+        self._with_gradient = with_gradient
+
+        def image(dtype: Any) -> wp.array:
+            return wp.zeros(size, dtype=dtype, device=device)
+
+        def gradient() -> wp.array:
+            return image(wp.vec3) if with_gradient else wp.empty(0, dtype=wp.vec3, device=device)
+
+        size = (batch, *shapes[0])
+        self._gradient = gradient()
+        self._coarse: list[Level] = []
+        for shape in shapes[1:]:
+            size = (batch, *shape)
+            images = image(wp.vec3), image(wp.vec3), image(wp.float32)
+            self._coarse.append(Level(*images, gradient()))
+
+    def build(self, vertices: wp.array, normals: wp.array, intensity: wp.array) -> list[Level]:
+        """All levels, finest first, of images (B, H, W); the coarse ones overwrite the last."""
+        if not self._levels or self._levels[0].vertices is not vertices:
+            self._levels = [Level(vertices, normals, intensity, self._gradient), *self._coarse]
+            self._launches = [self._downsampling(*pair) for pair in pairwise(self._levels)]
+            if self._with_gradient:
+                self._launches += [self._differentiation(level) for level in self._levels]
+        for launch in self._launches:
+            launch.launch()
+        return self._levels
+
+    def _downsampling(self, fine: Level, coarse: Level) -> RecordedLaunch:
+        source = [fine.vertices.flatten(), fine.normals.flatten(), fine.intensity.flatten()]
+        target = [coarse.vertices.flatten(), coarse.normals.flatten(), coarse.intensity.flatten()]
+        size = fine.vertices.shape[1:]
+        inputs = [*source, *size, EDGE_FRACTION, self._columns, *target]
+        return RecordedLaunch(_downsample, self._dim(coarse.intensity), inputs, self._device)
+
+    def _differentiation(self, level: Level) -> RecordedLaunch:
+        size, image = level.intensity.shape[1:], level.intensity
+        inputs = [image.flatten(), *size, self._columns, level.gradient.flatten()]
+        return RecordedLaunch(_intensity_gradient, self._dim(image), inputs, self._device)
+
+    def _dim(self, image: wp.array) -> tuple[int, int]:
+        """Threads of a kernel that writes ``image`` (B, h, w): a piece of a row each."""
+        batch, height, width = image.shape
+        return batch * height, -(-width // self._columns)
+
+
+Bool = NDArray[np.bool_]
+Float32 = NDArray[np.float32]
+_FROM = {0: np.s_[:-1, :], 1: np.s_[:, :-1]}  # pixels with a neighbour below, or to the right
+_TO = {0: np.s_[1:, :], 1: np.s_[:, 1:]}
+
+
+class Pieces:
+    """Connected pieces of a depth image, cut at steps of inverse depth and at creases.
+
+    Attributes:
+        labels: (h, w) number of the piece; 0 for the seams.
+        count: of the labels, 0 included.
+    """
+
+    def __init__(
+        self, depth: Float32, normals: Float32, largest_step: float, least_cosine: float
+    ) -> None:
+        """Cut the image.
+
+        Args:
+            depth: (h, w) metres, 0 = no reading.
+            normals: (h, w, 3) unit vectors; 0 = none.
+            largest_step: of inverse depth between neighbours, 1/m.
+            least_cosine: of the angle between their normals.
+        """
+        is_inner = depth > 0
+        inverse = np.where(is_inner, 1.0 / np.where(is_inner, depth, 1.0), -np.inf)
+        for axis in (0, 1):
+            a, b = _FROM[axis], _TO[axis]
+            is_joined = np.abs(inverse[a] - np.maximum(inverse[b], -1e6)) < largest_step
+            cosine = np.einsum("hwc,hwc->hw", normals[a], normals[b])
+            is_inner[a] &= is_joined & (cosine > least_cosine)
+        count, labels = cv2.connectedComponents(is_inner.astype(np.uint8), connectivity=4)
+        self.count, self.labels = count, np.asarray(labels)
+
+    def number(self, where: Bool) -> NDArray[np.int64]:
+        """(count,) pixels of each piece that are set in (h, w)."""
+        return np.bincount(self.labels[where], minlength=self.count)
+
+    def where(self, votes: Bool, against: Bool, share: float, least: NDArray[np.float64]) -> Bool:
+        """Pixels (h, w) of the pieces that are voted for.
+
+        Args:
+            votes: (h, w) for.
+            against: (h, w), unless they vote for.
+            share: of both that must be for.
+            least: (count,) votes, more than which there must be.
+        """
+        own, others = self.number(votes), self.number(against & ~votes)
+        chosen = (own > share * (own + others)) & (own > least)
+        chosen[0] = False
+        return chosen[self.labels]
+
+    def filled(self, values: Float32, limit: float) -> Float32:
+        """Values (h, w); where more than half of a piece is above a limit, no less than their mean.
+
+        So the parts of a thing that come into view are taken for what the rest of it is.
+        """
+        is_above = values > limit
+        above, all_pixels = self.number(is_above), np.bincount(self.labels.ravel())
+        weights = np.where(is_above, values, 0.0).ravel()
+        mean = np.bincount(self.labels.ravel(), weights) / np.maximum(above, 1)
+        mean[(above <= 0.5 * all_pixels) | (np.arange(self.count) == 0)] = -np.inf
+        return np.maximum(values, mean[self.labels]).astype(np.float32)

@@ -1,4 +1,17 @@
-"""Renders surfel maps: holds the buffers of one image size and runs the splatting kernels."""
+# mypy: disable-error-code="empty-body"
+# ruff: noqa: UP018, RUF046
+"""Renders surfel maps: footprints, z-buffer, average of the front surface, resolve.
+
+Two passes over the visible discs: the first finds the nearest surface of every pixel, the second
+averages all discs within the depth tolerance behind it (the visibility splatting of Botsch et al.,
+"High-quality surface splatting on today's GPUs", 2005). The inverse depth of a disc's plane is
+linear in the image, so the depth at a pixel is that of the viewing ray's intersection with the
+plane, at the cost of two multiplications; z-buffers hold inverse depth, 0 where empty.
+
+Launches are (envs, workers): the workers of an env share its list, and the CPU's single worker
+keeps the camera in registers. Image buffers are flat, which saves most of their address
+arithmetic.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +19,288 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from ms_slam_env._runtime.warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.slam.surfel import splatting
+from ms_slam_env.native import native_source
+from ms_slam_env.slam.surfel.device import fetch, put, raise_to
 from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller
-from ms_slam_env.slam.surfel.surfels import MapBuffers, SeenWindow, SplatCamera, VisibleList
+from ms_slam_env.slam.surfel.surfels import (
+    MapBuffers,
+    SeenWindow,
+    SplatCamera,
+    SplatFootprints,
+    Surfels,
+    VisibleList,
+    depth_tolerance,
+    floor_int,
+)
+
+
+@wp.func
+def half_extent(
+    p: wp.vec3, n: wp.vec3, across: float, tilt: float, radius: float, focal: float
+) -> float:
+    """How far a disc at p reaches from its centre in columns or rows.
+
+    A tilted disc is an ellipse: an offset d in its plane moves the column by (f / z) a . d with
+    a = (1, 0, -x / z), at most |d| times a's part in the plane. ``across`` is x or y, ``tilt`` the
+    normal's component there. The twentieth part more allows for perspective.
+    """
+    ratio = across / p[2]
+    part = tilt - ratio * n[2]
+    in_plane = wp.sqrt(wp.max(1.0 + ratio * ratio - part * part, 0.0))
+    return 1.05 * focal * radius / p[2] * in_plane
+
+
+@wp.func
+def drawn_radius(radius: float, z: float, camera: SplatCamera) -> float:
+    """Radius in metres after the limits in pixels."""
+    pixel = z / camera.focal[0]
+    return wp.clamp(radius, camera.min_px * pixel, camera.max_px * pixel)
+
+
+@wp.kernel
+def project_footprints(
+    visible: VisibleList, camera: SplatCamera, workers: int, footprints: SplatFootprints
+) -> None:
+    """Footprints of the listed surfels.
+
+    Several short loops without branches: the compiler turns them into operations on many surfels
+    at once, which it does not for loops that write many arrays.
+    """
+    k, worker = wp.tid()
+    fx = camera.focal[0]
+    fy = camera.focal[1]
+    cx = camera.centre[0]
+    cy = camera.centre[1]
+    share = (visible.count[k] + workers - 1) / workers
+    start = worker * share
+    end = wp.min(start + share, visible.count[k])
+    j = int(start)
+    while j < end:
+        p = fetch(visible.position, k, j)
+        inverse = 1.0 / p[2]
+        put(footprints.inverse, k, j, inverse)
+        put(footprints.u, k, j, fx * p[0] * inverse + cx)
+        put(footprints.v, k, j, fy * p[1] * inverse + cy)
+        j += 1
+    j = int(start)
+    while j < end:
+        n = fetch(visible.normal, k, j)
+        # n . ray = (n . p) / z for rays with z = 1: inverse depth is (n / (n . p)) . ray.
+        plane = 1.0 / wp.min(wp.dot(n, fetch(visible.position, k, j)), -1.0e-6)
+        put(footprints.slope_u, k, j, n[0] * plane / fx)
+        put(footprints.slope_v, k, j, n[1] * plane / fy)
+        j += 1
+    j = int(start)
+    while j < end:
+        z = fetch(visible.position, k, j)[2]
+        radius = drawn_radius(fetch(visible.radius, k, j), z, camera)
+        put(footprints.rim, k, j, radius * radius)
+        j += 1
+    j = int(start)
+    while j < end:
+        p = fetch(visible.position, k, j)
+        n = fetch(visible.normal, k, j)
+        radius = drawn_radius(fetch(visible.radius, k, j), p[2], camera)
+        reach = half_extent(p, n, p[0], n[0], radius, fx)
+        u = fx * p[0] / p[2] + cx
+        put(footprints.left, k, j, wp.max(floor_int(u - reach) + 1, 0))
+        put(footprints.right, k, j, wp.min(floor_int(u + reach), camera.width - 1))
+        j += 1
+    j = int(start)
+    while j < end:
+        p = fetch(visible.position, k, j)
+        n = fetch(visible.normal, k, j)
+        radius = drawn_radius(fetch(visible.radius, k, j), p[2], camera)
+        reach = half_extent(p, n, p[1], n[1], radius, fy)
+        v = fy * p[1] / p[2] + cy
+        put(footprints.top, k, j, wp.max(floor_int(v - reach) + 1, 0))
+        put(footprints.bottom, k, j, wp.min(floor_int(v + reach), camera.height - 1))
+        j += 1
+
+
+Sums: Any = wp.types.vector(length=8, dtype=wp.float32)
+"""Weighted sums of a pixel: normal (3), weight, colour (3), depth."""
+
+
+@wp.func
+def squared_offset(x: float, y: float, z: float, inverse_offset: float) -> float:
+    """Squared distance (m2) from the centre of a disc at depth z of a point of its plane.
+
+    The point is x, y (m) and an inverse depth away from the centre. To first order in the offset:
+    only the disc's rim moves, by less than its perspective.
+    """
+    away = z * z * inverse_offset
+    return x * x + y * y + away * away
+
+
+@wp.kernel
+def splat_depth(
+    visible: VisibleList,
+    camera: SplatCamera,
+    workers: int,
+    footprints: SplatFootprints,
+    z_buffer: wp.array[wp.float32],
+) -> None:
+    """Inverse depth (E * H * W) of the nearest disc at every pixel; list the discs on a pixel."""
+    k, worker = wp.tid()
+    width = camera.width
+    image = k * camera.height * width
+    count = visible.count[k]
+    j = int(worker)
+    while j < count:
+        left = fetch(footprints.left, k, j)
+        right = fetch(footprints.right, k, j)
+        row = fetch(footprints.top, k, j)
+        bottom = fetch(footprints.bottom, k, j)
+        if left <= right and row <= bottom:
+            centre_u = fetch(footprints.u, k, j)
+            centre_v = fetch(footprints.v, k, j)
+            centre_inverse = fetch(footprints.inverse, k, j)
+            slope_u = fetch(footprints.slope_u, k, j)
+            slope_v = fetch(footprints.slope_v, k, j)
+            rim = fetch(footprints.rim, k, j)
+            nearly_rim = rim * 1.00001  # ``splat_attributes`` rounds otherwise
+            hits = int(0)
+            z = 1.0 / centre_inverse
+            pixel_u = z / camera.focal[0]
+            pixel_v = z / camera.focal[1]
+            while row <= bottom:
+                dv = float(row) - centre_v
+                u = int(left)
+                while u <= right:
+                    du = float(u) - centre_u
+                    offset = du * slope_u + dv * slope_v
+                    squared = squared_offset(du * pixel_u, dv * pixel_v, z, offset)
+                    hits += wp.where(squared <= nearly_rim, 1, 0)
+                    inverse = wp.where(squared <= rim, centre_inverse + offset, 0.0)
+                    raise_to(z_buffer, image + row * width + u, inverse)
+                    u += 1
+                row += 1
+            if hits > 0:
+                put(footprints.drawn, k, wp.atomic_add(footprints.num_drawn, k, 1), j)
+        j += workers
+
+
+@wp.kernel
+def splat_attributes(
+    surfels: Surfels,
+    visible: VisibleList,
+    first_env: int,
+    camera: SplatCamera,
+    workers: int,
+    footprints: SplatFootprints,
+    z_buffer: wp.array[wp.float32],
+    sums: wp.array[Sums],
+) -> None:
+    """Sum the discs of the front surface at every pixel.
+
+    The weight is the confidence, at most ``max_weight``, falling off towards the disc's rim.
+    """
+    k, worker = wp.tid()
+    b = first_env + k
+    width = camera.width
+    image = k * camera.height * width
+    count = footprints.num_drawn[k]
+    d = int(worker)
+    while d < count:
+        j = fetch(footprints.drawn, k, d)
+        left = fetch(footprints.left, k, j)
+        right = fetch(footprints.right, k, j)
+        row = fetch(footprints.top, k, j)
+        bottom = fetch(footprints.bottom, k, j)
+        centre_u = fetch(footprints.u, k, j)
+        centre_v = fetch(footprints.v, k, j)
+        centre_inverse = fetch(footprints.inverse, k, j)
+        slope_u = fetch(footprints.slope_u, k, j)
+        slope_v = fetch(footprints.slope_v, k, j)
+        per_rim = 1.0 / fetch(footprints.rim, k, j)
+        n = fetch(visible.normal, k, j)
+        i = fetch(visible.index, k, j)
+        color = fetch(surfels.color, b, i)
+        confidence = wp.min(fetch(surfels.confidence, b, i), camera.max_weight)
+        z = 1.0 / centre_inverse
+        pixel_u = z / camera.focal[0]
+        pixel_v = z / camera.focal[1]
+        # Same surface: z < front + tolerance. To first order in inverse depth.
+        reach = depth_tolerance(camera.tolerance_m, z) * centre_inverse * centre_inverse
+        while row <= bottom:
+            dv = float(row) - centre_v
+            u = int(left)
+            while u <= right:
+                du = float(u) - centre_u
+                offset = du * slope_u + dv * slope_v
+                inverse = centre_inverse + offset
+                share = squared_offset(du * pixel_u, dv * pixel_v, z, offset) * per_rim
+                pixel = image + row * width + u
+                if share <= 1.0 and inverse >= fetch(z_buffer, pixel) - reach:
+                    w = confidence * (1.05 - share)
+                    sample = Sums(
+                        n[0], n[1], n[2], 1.0, color[0], color[1], color[2], 1.0 / inverse
+                    )
+                    wp.atomic_add(sums, pixel, w * sample)
+                u += 1
+            row += 1
+        d += workers
+
+
+@wp.kernel
+def list_hidden(
+    visible: VisibleList,
+    camera: SplatCamera,
+    workers: int,
+    z_buffer: wp.array[wp.float32],
+    hidden: VisibleList,
+) -> None:
+    """List the visible surfels well behind the front surface at their own pixel."""
+    k, worker = wp.tid()
+    image = k * camera.height * camera.width
+    for j in range(worker, visible.count[k], workers):
+        p = visible.position[k, j]
+        u = floor_int(camera.focal[0] * p[0] / p[2] + camera.centre[0] + 0.5)
+        v = floor_int(camera.focal[1] * p[1] / p[2] + camera.centre[1] + 0.5)
+        if u >= 0 and u < camera.width and v >= 0 and v < camera.height:
+            inverse = z_buffer[image + v * camera.width + u]
+            if inverse > 0.0:
+                front = 1.0 / inverse
+                if p[2] > front + 2.0 * depth_tolerance(camera.tolerance_m, front):
+                    slot = wp.atomic_add(hidden.count, k, 1)
+                    hidden.index[k, slot] = visible.index[k, j]
+                    hidden.position[k, slot] = p
+                    hidden.normal[k, slot] = visible.normal[k, j]
+                    hidden.radius[k, slot] = visible.radius[k, j]
+
+
+@wp.func_native(native_source("splatting", "resolve_row"))
+def resolve_row(
+    sums: wp.array[Sums],
+    camera: SplatCamera,
+    y: float,
+    first: int,
+    vertices: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    intensity: wp.array[wp.float32],
+    color: wp.array[wp.vec3],
+) -> None:
+    """Resolve the row of pixels from ``first`` on, on which the rays have ``y`` at z = 1."""
+
+
+@wp.kernel
+def resolve(
+    sums: wp.array[Sums],
+    camera: SplatCamera,
+    vertices: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+    intensity: wp.array[wp.float32],
+    color: wp.array[wp.vec3],
+) -> None:
+    """Divide the sums by their weights; pixels that no disc covers become 0."""
+    k, v = wp.tid()
+    y = (float(v) - camera.centre[1]) / camera.focal[1]
+    first = (k * camera.height + v) * camera.width
+    resolve_row(sums, camera, y, first, vertices, normals, intensity, color)
 
 
 @dataclass(frozen=True)
@@ -76,12 +366,12 @@ class SplatRenderer:
         self._buffers = buffers
         pixels = envs * intrinsics.width * intrinsics.height
         self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=self.device)
-        self._sums = wp.zeros(pixels, dtype=splatting.Sums, device=self.device)
+        self._sums = wp.zeros(pixels, dtype=Sums, device=self.device)
         self._culler = FrustumCuller(buffers, envs, self.camera, window)
         self._splats: dict[tuple[int, int], list[RecordedLaunch]] = {}
         images = [a.flatten() for a in (view.vertices, view.normals, view.intensity, view.color)]
         dim, inputs = (envs, intrinsics.height), [self._sums, self.camera, *images]
-        self._resolve = RecordedLaunch(splatting.resolve, dim, inputs, self.device)
+        self._resolve = RecordedLaunch(resolve, dim, inputs, self.device)
 
     def _new_view(self) -> ModelView:
         def image(dtype: Any) -> wp.array:
@@ -121,9 +411,9 @@ class SplatRenderer:
         shared = [listed, self.camera, workers, self._buffers.footprints]
         listed_in = [surfels, listed, first_env, *shared[1:]]
         passes = (
-            (splatting.project_footprints, shared),
-            (splatting.splat_depth, [*shared, self._z_buffer]),
-            (splatting.splat_attributes, [*listed_in, self._z_buffer, self._sums]),
+            (project_footprints, shared),
+            (splat_depth, [*shared, self._z_buffer]),
+            (splat_attributes, [*listed_in, self._z_buffer, self._sums]),
         )
         dim = (self.envs, workers)
         return [RecordedLaunch(kernel, dim, inputs, self.device) for kernel, inputs in passes]
@@ -133,4 +423,4 @@ class SplatRenderer:
         hidden.count.zero_()
         workers = self._buffers.workers
         inputs = [self.visible, self.camera, workers, self._z_buffer, hidden]
-        wp.launch(splatting.list_hidden, (self.envs, workers), inputs, device=self.device)
+        wp.launch(list_hidden, (self.envs, workers), inputs, device=self.device)

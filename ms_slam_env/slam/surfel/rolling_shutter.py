@@ -21,15 +21,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ms_slam_env._runtime.warp import RecordedLaunch, wp
+from ms_slam_env._runtime.warp import RecordedLaunch
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import se3_log
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.preprocessing import check_images
-from ms_slam_env.slam.surfel.relocalization import Images
 
 PIECE = 64  # columns that are worked on together, by short loops over several of them at once
 
@@ -38,10 +39,10 @@ PIECE = 64  # columns that are worked on together, by short loops over several o
 class Rows:
     """Frames of B envs as they were read, flat, and the motion that goes with them."""
 
-    color: wp.array(dtype=wp.uint8)
-    depth: wp.array(dtype=wp.float32)
-    turn: wp.array(dtype=wp.vec3)  # (B,) over the time from the first row to the last, radians
-    step: wp.array(dtype=wp.vec3)  # metres
+    color: wp.array[wp.uint8]
+    depth: wp.array[wp.float32]
+    turn: wp.array[wp.vec3]  # (B,) over the time from the first row to the last, radians
+    step: wp.array[wp.vec3]  # metres
     size: wp.vec2i  # (width, height)
     focal: wp.vec2
     centre: wp.vec2
@@ -53,18 +54,18 @@ def level_piece(
     b: int,
     v: int,
     piece: int,
-    color: wp.array(dtype=wp.uint8),
-    depth: wp.array(dtype=wp.float32),
-):
+    color: wp.array[wp.uint8],
+    depth: wp.array[wp.float32],
+) -> None:
     """Fill a piece of row v of the levelled images of env b, all of its pixels step by step."""
 
 
 @wp.kernel
 def _level(
     rows: Rows,
-    color: wp.array(dtype=wp.uint8),  # out
-    depth: wp.array(dtype=wp.float32),  # out
-):
+    color: wp.array[wp.uint8],  # out
+    depth: wp.array[wp.float32],  # out
+) -> None:
     """Fill a piece of a row of the levelled images."""
     b, v, piece = wp.tid()
     level_piece(rows, b, v, piece, color, depth)
@@ -102,59 +103,39 @@ class _Leveller:
 
 
 class Shutter(Saved):
-    """How the rows of the frames of B envs are taken; here all at once."""
+    """How the rows of the frames of B envs are taken: the last ``readout_s`` after the first.
 
-    is_rolling = False
-
-    def use(self, intrinsics: Intrinsics) -> None:
-        """Expect frames of a camera."""
-
-    def take_time(self, times_s: Sequence[float] | None) -> None:
-        """From now on motions are those that led to the frames of these times (B,)."""
-
-    def level(self, taken: Images, motions: Float64) -> Images:
-        """The frames as of one instant, with cameras that move like ``motions`` (B, 4, 4)."""
-        return taken
-
-    def forget(self, env: int) -> None:
-        """Know no earlier frame of an env."""
-
-
-class RollingShutter(Shutter):
-    """Rows that are read one after the other, the last of them ``readout_s`` after the first.
-
-    Frames whose time is not known, or is not after the last one's, are left as they are.
+    Frames whose time is not known, or is not after the last one's, are left as they are; all are
+    where ``readout_s`` is 0.
     """
 
-    saved = ("_times", "_intervals")
-    is_rolling = True
-
     def __init__(self, batch: int, readout_s: float, device: str) -> None:
+        self.is_rolling = readout_s > 0
+        if self.is_rolling:
+            self.saved = ("_times", "_intervals")  # type: ignore[misc]
         self._readout_s, self._device = readout_s, device
         self._times: Float64 = np.full(batch, np.nan)
         self._intervals: Float64 = np.full(batch, np.nan)  # between them and those before
         self._leveller: _Leveller
 
     def use(self, intrinsics: Intrinsics) -> None:
-        """See the base class."""
-        self._leveller = _Leveller(len(self._times), intrinsics, self._device)
+        """Expect frames of a camera."""
+        if self.is_rolling:
+            self._leveller = _Leveller(len(self._times), intrinsics, self._device)
 
     def take_time(self, times_s: Sequence[float] | None) -> None:
-        """See the base class."""
+        """From now on motions are those that led to the frames of these times (B,)."""
         now = np.full_like(self._times, np.nan) if times_s is None else np.array(times_s, float)
         self._intervals, self._times = now - self._times, now
 
     def level(self, taken: Images, motions: Float64) -> Images:
-        """See the base class."""
+        """The frames as of one instant, with cameras that move like ``motions`` (B, 4, 4)."""
+        if not self.is_rolling:
+            return taken
         is_later = self._intervals > 0
         share = self._readout_s / np.where(is_later, self._intervals, np.inf)
         return self._leveller(taken, share[:, None] * np.stack([se3_log(T) for T in motions]))
 
     def forget(self, env: int) -> None:
-        """See the base class."""
+        """Know no earlier frame of an env."""
         self._times[env] = self._intervals[env] = np.nan
-
-
-def make_shutter(batch: int, readout_s: float, device: str) -> Shutter:
-    """The shutter of B envs whose rows take ``readout_s``; 0: all are taken at once."""
-    return RollingShutter(batch, readout_s, device) if readout_s else Shutter()

@@ -1,10 +1,10 @@
 """The surfel SLAM of B envs: track a frame against the map's view, fuse it, close loops.
 
-ElasticFusion (Whelan et al., RSS 2015, figure 2). While tracking is lost the
-pose is held, nothing is fused, and every frame is tried against the map around the last good pose
-and around keyframes that resemble it (``localization``, ``relocalization``).
-The view that frames are tracked against shows living surfels of every age: with steps of
-centimetres a view seldom lasts until its surfels are stable.
+ElasticFusion (Whelan et al., RSS 2015, figure 2). While tracking is lost the pose is held, nothing
+is fused, and every frame is tried against the map around the last good pose and around keyframes
+that resemble it (``localization``, ``keyframe_search``). The view that frames are tracked against
+shows living surfels of every age: with steps of centimetres a view seldom lasts until its surfels
+are stable.
 """
 
 from __future__ import annotations
@@ -24,23 +24,20 @@ from ms_slam_env.slam.shared.ferns import Candidate
 from ms_slam_env.slam.shared.state import Saved, check_has
 from ms_slam_env.slam.slam_backend import Float64, TrackResult
 from ms_slam_env.slam.surfel.acceptance import Alignment, with_doubt
-from ms_slam_env.slam.surfel.camera_states import CameraStates
-from ms_slam_env.slam.surfel.detached_map import DetachedMap
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask
-from ms_slam_env.slam.surfel.keyframe_search import make_relocalization
-from ms_slam_env.slam.surfel.localization import Localizer
+from ms_slam_env.slam.surfel.keyframe_search import Images, make_relocalization
+from ms_slam_env.slam.surfel.localization import CameraStates, Localizer, MapAligner
 from ms_slam_env.slam.surfel.loop_closure import make_loop_closure
-from ms_slam_env.slam.surfel.map_alignment import MapAligner
-from ms_slam_env.slam.surfel.photometry import is_invalid_frame, same_exposure
+from ms_slam_env.slam.surfel.photometry import is_invalid_frame
 from ms_slam_env.slam.surfel.pipeline import Pipeline, PipelineCache, check_change
 from ms_slam_env.slam.surfel.pose_hypotheses import check_guesses, check_poses, motion_weight
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
-from ms_slam_env.slam.surfel.relocalization import Images
-from ms_slam_env.slam.surfel.rolling_shutter import make_shutter
+from ms_slam_env.slam.surfel.rolling_shutter import Shutter
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.tracker import model_stride
+from ms_slam_env.slam.surfel.trajectory_history import DetachedMap
 
 FEWEST_READINGS = 0.05  # share of the first frame's pixels that must have depth
 
@@ -58,9 +55,9 @@ class BatchedSurfelSlam(Saved):
         self._pipelines = PipelineCache(self.map)
         self.loops = make_loop_closure(self.map, config, device)
         self.relocalization = make_relocalization(batch, intrinsics, config)
-        self._states = CameraStates.at_rest(batch)
+        self._states = CameraStates(batch)
         self.motion_mask = make_motion_mask(batch, intrinsics, config, device)
-        self._shutter = make_shutter(batch, config.readout_s, device)
+        self._shutter = Shutter(batch, config.readout_s, device)
         self.aligner = MapAligner(self._states, self.map, self.motion_mask)
         parts = self._states, self.aligner, self.relocalization, self.motion_mask
         self._localizer = Localizer(*parts, intrinsics)
@@ -155,12 +152,11 @@ class BatchedSurfelSlam(Saved):
         self._invalid_frames.find(frames.color, states.started)
         self.motion_mask.expect(live, poses, states.started)
         self.motion_mask.find(poses, states.started)
-        states.motions = motions
-        for env in range(self.batch):
+        states.follow(poses, motions)
+        for env in np.flatnonzero(~states.started):
             # With too little to see, the first frame that is tracked starts the map.
-            states.started[env] = states.started[env] or _readings(env, live) >= FEWEST_READINGS
-        states.poses = poses
-        states.lost[:] = 0
+            if _readings(int(env), live) >= FEWEST_READINGS:
+                states.start(int(env))
         everywhere = np.ones(self.batch, dtype=bool)
         self._last_frames.keep(frames.color, frames.depth, poses, everywhere)
         self._fuse(live, frames, everywhere)
@@ -191,7 +187,7 @@ class BatchedSurfelSlam(Saved):
             live = self.preprocess(frames.color, frames.depth)
             for env in np.flatnonzero(where):
                 self._forget_map(int(env))
-            self._states.time -= 1
+            self._states.count(-1)
             self._fuse(live, frames, where)
 
     def _follow(self, env: int, live: LiveFrame, alignment: Alignment) -> TrackResult:
@@ -205,7 +201,7 @@ class BatchedSurfelSlam(Saved):
         if _readings(env, live) < FEWEST_READINGS:
             reason = "the first frame has too few depth readings"
             return TrackResult(pose, False, inlier_fraction=0.0, reason=reason, overlap=0.0)
-        self._states.started[env] = True
+        self._states.start(env)
         return TrackResult(pose, True, moving=self.motion_mask.mask(env))
 
     def _move_on(self, env: int, alignment: Alignment) -> TrackResult:
@@ -248,7 +244,7 @@ class BatchedSurfelSlam(Saved):
             self.map.fuse(live, *(buffer.array for buffer in self._fused))
             self.loops.record(states.poses, states.time, good)
             self.aligner.forget_view()
-        states.time += 1
+        states.count()
 
     def _close_loops(
         self, live: LiveFrame, frames: Images, results: list[TrackResult]
@@ -260,15 +256,15 @@ class BatchedSurfelSlam(Saved):
 
         tracked = np.array([result.fused for result in results])
         closed = self.loops.close(live, self.poses, self._states.time - 1, tracked, similar)
-        for env, loop in closed.items():
+        for env, (loop, pose) in closed.items():
             results[env] = replace(results[env], loop=loop)
             if not loop.bent:
                 continue
-            self._last_frames.move(env, self.poses[env])
+            self._states.move_to(env, pose)
+            self._last_frames.move(env, pose)
             self.relocalization.move_keyframes(env, *self.loops.trajectory(env))
             self.motion_mask.forget(env)  # the map and the earlier frames no longer agree
-            pose = self.poses[env].copy()
-            results[env] = replace(results[env], T_world_camera=pose, loop_closed=True)
+            results[env] = replace(results[env], T_world_camera=pose.copy(), loop_closed=True)
         return results
 
     # -- Maps that come and go ---------------------------------------------------------------
@@ -294,13 +290,13 @@ class BatchedSurfelSlam(Saved):
         """Forget an env's map and its last frame, which is to be taken first of a new one."""
         frame = self.last_frame(env)
         self.reset(T_world_camera, env)
-        self._states.time[env] = frame
+        self._states.set_time(env, frame)
 
     def move_camera(self, T: Float64, env: int = 0) -> None:
         """Move an env's camera by ``T`` (4, 4) of the world."""
-        self._states.poses[env] = T @ self._states.poses[env]
+        self._states.move_to(env, T @ self.poses[env])
         self.motion_mask.forget(env)
-        self._last_frames.move(env, self._states.poses[env])
+        self._last_frames.move(env, self.poses[env])
 
     def last_frame(self, env: int = 0) -> int:
         """Number of an env's last frame."""
@@ -310,7 +306,7 @@ class BatchedSurfelSlam(Saved):
         """Seek an env's next frame in its map, whatever the light is by now."""
         if self._states.started[env]:
             self._states.hold(env)
-            self._states.photometry[env] = same_exposure(1)[0]
+            self._states.forget_exposure(env)
             self.motion_mask.forget(env)
 
     def motion(self, env: int = 0) -> Float64:

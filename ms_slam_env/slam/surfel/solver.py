@@ -3,13 +3,27 @@
 
 One thread per env and hypothesis, in float64. Source of the exponential: Sola et al., "A micro
 Lie theory" (2018), equations (172) and (174).
+
+Directions of the pose that the data do not constrain are left alone. Solution remapping: Zhang,
+Kaess and Singh, "On degeneracy of optimization-based state estimation problems" (ICRA 2016),
+equations (13) to (18). The update is taken only along those eigenvectors of the normal matrix with
+enough information; along the others the pose keeps what was predicted. Rotations are first
+multiplied by a length that makes them comparable with translations: the distance at which both move
+the points alike.
+
+Noise of the normals seems to constrain the sliding and turning of a plane too. Up to the mean of
+1 - cos of the angle between model and live normals, their noise per axis, geometric information
+along a direction may be only that. On blank walls and corners, with 1 mm to 4 mm of noise, it is
+0.02 to 0.28 of it; in the weakest direction of a furnished room at least 0.48.
 """
 
 from __future__ import annotations
 
-from ms_slam_env._runtime.warp import wp
+from typing import Any
+
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
-from ms_slam_env.slam.surfel.alignment_arrays import (
+from ms_slam_env.slam.surfel.normal_equations import (
     NUM_SUMS,
     RESTING,
     RUNNING,
@@ -18,20 +32,125 @@ from ms_slam_env.slam.surfel.alignment_arrays import (
     Photometry,
     Sum,
     Weights,
+    accumulate_row,
 )
-from ms_slam_env.slam.surfel.degeneracy import (
-    gradient_in_metres,
-    in_metres,
-    mat66d,
-    remapped_step,
-    turning_length,
-    vec6d,
-)
-from ms_slam_env.slam.surfel.normal_equations import accumulate_row
+
+mat66d: Any = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
+mat76d: Any = wp.types.matrix(shape=(7, 6), dtype=wp.float64)
+vec6d: Any = wp.types.vector(length=6, dtype=wp.float64)
+NORMAL_NOISE = wp.constant(wp.float64(0.3))  # share of that mean that is worth nothing
+LEAST_INFORMATION = wp.constant(wp.float64(0.5))  # per matched point, 1/m^2: 2 cm of 5000 points
+OPEN_VARIANCE = wp.constant(wp.float64(0.03 * 0.03))  # m^2, of a frame's predicted motion
+GEOMETRIC_NOISE = wp.constant(wp.float64(0.022))  # covariance of the gradient over A or B;
+PHOTOMETRIC_NOISE = wp.constant(wp.float64(0.34))  # see experiments/pose_covariance.py
+SINGULAR = wp.constant(wp.float64(1.0e-6))
+
+
+@wp.func_native(native_source("eigen", "eigen"))
+def eigen(H: mat66d) -> mat76d:
+    """Eigenvectors of a symmetric matrix as columns, eigenvalues below, by cyclic Jacobi."""
 
 
 @wp.func
-def reduce_sum(hypotheses: Hypotheses, slots: int, b: int, k: int, i: int):
+def _trace(H: mat66d, first: int) -> wp.float64:
+    return H[first, first] + H[first + 1, first + 1] + H[first + 2, first + 2]
+
+
+@wp.func
+def turning_length(H: mat66d) -> wp.float64:
+    """Distance d in metres at which a rotation moves the points like a translation."""
+    rho = _trace(H, 0)
+    length = wp.float64(1.0)
+    if rho > wp.float64(0.0):
+        length = wp.clamp(wp.sqrt(_trace(H, 3) / rho), wp.float64(0.01), wp.float64(100.0))
+    return length
+
+
+@wp.func
+def in_metres(H: mat66d, length: wp.float64) -> mat66d:
+    """Normal matrix in a rotation times ``length``."""
+    S = H
+    for i in range(6):
+        for j in range(6):
+            if i >= 3:
+                S[i, j] = S[i, j] / length
+            if j >= 3:
+                S[i, j] = S[i, j] / length
+    return S
+
+
+@wp.func
+def is_constrained(
+    E: mat76d, k: int, geometric: mat66d, tilted: wp.float64, matched: wp.float64
+) -> bool:
+    """Whether the data constrain eigenvector ``k`` of the normal matrix; matrices in metres."""
+    known = wp.float64(0.0)
+    for i in range(6):
+        for j in range(6):
+            known += E[i, k] * geometric[i, j] * E[j, k]
+    information = E[6, k] - wp.min(known, NORMAL_NOISE * tilted)
+    return information > LEAST_INFORMATION * matched + SINGULAR
+
+
+@wp.func
+def gradient_in_metres(g: vec6d, length: wp.float64) -> vec6d:
+    """Gradient with respect to a rotation times ``length``."""
+    scaled = g
+    for i in range(3, 6):
+        scaled[i] = g[i] / length
+    return scaled
+
+
+@wp.func
+def remapped_step(
+    A: mat66d,
+    B: mat66d,
+    gradient: vec6d,
+    tilted: wp.float64,
+    matched: wp.float64,
+    damping: wp.float64,
+) -> vec6d:
+    """Solution of (A + B) xi = -gradient in the constrained directions, 0 in the others; metres."""
+    E = eigen(A + B)
+    xi = vec6d()
+    for k in range(6):
+        if is_constrained(E, k, A, tilted, matched):
+            along = wp.float64(0.0)
+            for i in range(6):
+                along -= E[i, k] * gradient[i]
+            along = along / (E[6, k] * (wp.float64(1.0) + damping))
+            for i in range(6):
+                xi[i] += E[i, k] * along
+    return xi
+
+
+@wp.func
+def pose_covariance(
+    E: mat76d, A: mat66d, B: mat66d, tilted: wp.float64, matched: wp.float64, length: wp.float64
+) -> wp.spatial_matrixd:
+    """Covariance H^-1 (a A + b B) H^-1 of the pose, metres and radians, H = A + B in metres.
+
+    The weights of the two terms were chosen for accuracy, so H^-1 is no covariance: a A and b B
+    are those of the gradients. Along directions that the view leaves open it is the prediction's.
+    """
+    inverse = mat66d()
+    C = mat66d()
+    for k in range(6):
+        is_open = not is_constrained(E, k, A, tilted, matched)
+        for i in range(6):
+            for j in range(6):
+                along = E[i, k] * E[j, k]
+                if is_open:
+                    C[i, j] += OPEN_VARIANCE * along
+                else:
+                    inverse[i, j] += along / E[6, k]
+    C += inverse * (GEOMETRIC_NOISE * A + PHOTOMETRIC_NOISE * B) * inverse
+    C = in_metres(C, length)
+    return wp.float64(0.5) * (C + wp.transpose(C))
+
+
+@wp.func
+def reduce_sum(hypotheses: Hypotheses, slots: int, b: int, k: int, i: int) -> None:
     """Add up one of the partial sums of hypothesis k of env b, always in the same order."""
     total = wp.float64(0.0)
     for slot in range(slots):
@@ -40,12 +159,12 @@ def reduce_sum(hypotheses: Hypotheses, slots: int, b: int, k: int, i: int):
 
 
 @wp.func_native(native_source("sum_reduction", "reduce_all_sums", SUMS=NUM_SUMS))
-def reduce_all_sums(hypotheses: Hypotheses, slots: int, b: int, k: int):
+def reduce_all_sums(hypotheses: Hypotheses, slots: int, b: int, k: int) -> None:
     """The same for all of them, several at a time."""
 
 
 @wp.kernel
-def reduce_sums(hypotheses: Hypotheses, slots: int):
+def reduce_sums(hypotheses: Hypotheses, slots: int) -> None:
     """Add up the partial sums of every active hypothesis."""
     b, k, i = wp.tid()
     if hypotheses.state[b, k] == RUNNING:
@@ -53,7 +172,7 @@ def reduce_sums(hypotheses: Hypotheses, slots: int):
 
 
 @wp.func
-def load_hessian(sums: wp.array3d(dtype=wp.float64), b: int, k: int, first: int):
+def load_hessian(sums: wp.array3d[wp.float64], b: int, k: int, first: int) -> mat66d:
     """Symmetric H of 21 sums from ``first`` on."""
     H = mat66d()
     index = wp.int32(first)
@@ -67,7 +186,9 @@ def load_hessian(sums: wp.array3d(dtype=wp.float64), b: int, k: int, first: int)
 
 
 @wp.func
-def load_terms(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
+def load_terms(
+    sums: wp.array3d[wp.float64], b: int, k: int
+) -> tuple[mat66d, mat66d, vec6d, vec6d, wp.float64]:
     """Both terms' H and g for a rotation times a length, and that length in metres."""
     A = load_hessian(sums, b, k, Sum.GEOMETRIC_HESSIAN)
     B = load_hessian(sums, b, k, Sum.PHOTOMETRIC_HESSIAN)
@@ -85,7 +206,7 @@ def load_terms(sums: wp.array3d(dtype=wp.float64), b: int, k: int):
 
 
 @wp.func
-def cholesky(H: mat66d):
+def cholesky(H: mat66d) -> mat66d:
     """Lower factor L of H = L L^T; L[0, 0] = 0 if H is not positive definite."""
     L = mat66d()
     for i in range(6):
@@ -106,7 +227,7 @@ def cholesky(H: mat66d):
 
 
 @wp.func
-def cholesky_solve(L: mat66d, right: vec6d):
+def cholesky_solve(L: mat66d, right: vec6d) -> vec6d:
     """Solution x of L L^T x = right."""
     y = vec6d()
     for i in range(6):
@@ -127,7 +248,7 @@ def cholesky_solve(L: mat66d, right: vec6d):
 
 
 @wp.func
-def se3_exp(xi: vec6d):
+def se3_exp(xi: vec6d) -> wp.mat44d:
     """Rigid motion of the twist (rho in metres, phi in radians)."""
     one = wp.float64(1.0)
     x = xi[3]
@@ -157,7 +278,7 @@ def se3_exp(xi: vec6d):
 
 
 @wp.func
-def se3_log(T: wp.mat44d):
+def se3_log(T: wp.mat44d) -> vec6d:
     """Twist of a small rigid motion: exact in the rotation, to third order in the translation."""
     half = wp.float64(0.5)
     w = half * wp.vec3d(T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1])
@@ -172,7 +293,7 @@ def se3_log(T: wp.mat44d):
 
 
 @wp.func
-def invert_rigid(T: wp.mat44d):
+def invert_rigid(T: wp.mat44d) -> wp.mat44d:
     """Inverse of a rigid motion."""
     zero = wp.float64(0.0)
     x = wp.vec3d(T[0, 0], T[1, 0], T[2, 0])
@@ -188,7 +309,7 @@ def invert_rigid(T: wp.mat44d):
 
 
 @wp.func
-def orthonormalise(T: wp.mat44d):
+def orthonormalise(T: wp.mat44d) -> wp.mat44d:
     """Rigid motion nearest to a product of rigid motions, by Gram-Schmidt on its columns."""
     x = wp.normalize(wp.vec3d(T[0, 0], T[1, 0], T[2, 0]))
     y = wp.vec3d(T[0, 1], T[1, 1], T[2, 1])
@@ -209,8 +330,8 @@ LARGEST_GAIN = wp.constant(wp.float64(5.0))
 
 @wp.func
 def update_photometry(
-    sums: wp.array3d(dtype=wp.float64), b: int, k: int, photometry: Photometry, least_scale: float
-):
+    sums: wp.array3d[wp.float64], b: int, k: int, photometry: Photometry, least_scale: float
+) -> Photometry:
     """Gain and bias from the sums of a pass; scale by a step to its fixed point.
 
     The gain stays where it is between the slopes of the regressions of the live on the model's
@@ -258,7 +379,7 @@ def take_step(
     least_scale: float,
     b: int,
     k: int,
-):
+) -> None:
     """Move hypothesis k of env b where the data constrain it; it rests once it has converged."""
     sums = hypotheses.sums
     before = hypotheses.photometry[b, k]
@@ -283,7 +404,7 @@ def gauss_newton_step(
     smallest_step: wp.float64,  # metres and radians; below it the level has converged
     last: wp.int32,  # 1: last iteration of its level, so the next level may go on
     least_scale: wp.float32,
-):
+) -> None:
     """Move every active hypothesis; stop those that converged."""
     b, k = wp.tid()
     if hypotheses.state[b, k] == RUNNING:
@@ -303,7 +424,7 @@ def iterate_at_once(
     smallest_step: wp.float64,
     iterations: int,
     ends_with_sums: int,  # 1: leave the sums at the poses that the last steps led to
-):
+) -> None:
     """All iterations of a level, one thread a hypothesis.
 
     The same as ``accumulate_normal_equations``, ``reduce_sums`` and ``gauss_newton_step`` in turns,

@@ -11,23 +11,231 @@ map is moved onto the older, and both are one again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.geometry import invert, se3_exp, se3_log
+from ms_slam_env.slam.shared.alignment_check import AlignmentStatistics
+from ms_slam_env.slam.shared.map_fit import FitConfig, measure_fit, why_not_believed
 from ms_slam_env.slam.shared.state import Saved
-from ms_slam_env.slam.shared.state_check import ListOf, WholeNumber
-from ms_slam_env.slam.shared.submap_frames import SubmapLedger, Submaps, one_submap
-from ms_slam_env.slam.slam_backend import Float64, TrackResult
-from ms_slam_env.slam.surfel.detached_map import DetachedMap
-from ms_slam_env.slam.surfel.map_search import JointSearch, MapFinder
-from ms_slam_env.slam.surfel.relocalization import Images
+from ms_slam_env.slam.shared.state_check import Fields, ListOf, OrNone, WholeNumber
+from ms_slam_env.slam.shared.submap_frames import SubmapLedger, Submaps
+from ms_slam_env.slam.slam_backend import Float64, TrackResult, Views
+from ms_slam_env.slam.surfel.acceptance import Alignment
+from ms_slam_env.slam.surfel.keyframe_search import Images, measure_consistency
+from ms_slam_env.slam.surfel.pose_hypotheses import is_within, tracking_hypotheses
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.surfel_config import SubmapConfig
-from ms_slam_env.slam.surfel.trajectory_history import TrajectoryHistory
+from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+from ms_slam_env.slam.surfel.trajectory_history import DetachedMap, TrajectoryHistory
+from ms_slam_env.slam.surfel.view_prediction import mean_pose
+
+_FIT = FitConfig(queries=8)
+
+
+class FrameLookup:
+    """Looks for a frame in the map of a SLAM of one camera, which stays as it is."""
+
+    def __init__(self, slam: BatchedSurfelSlam, frames: Images) -> None:
+        """Look for ``frames`` (1, H, W) from now on; the SLAM's next frame ends that."""
+        self._slam, self._frames = slam, frames
+        slam.aligner.set_frame(slam.preprocess(frames.color, frames.depth))
+
+    def align_near(self, pose: Float64) -> Alignment:
+        """Align with the map as seen from ``pose`` (4, 4), under strict thresholds."""
+        return self._slam.aligner.align_strictly(pose[None], tracking_hypotheses(np.eye(4))[None])
+
+    def consistency(self, poses: Float64) -> AlignmentStatistics:
+        """How the frame agrees with the map's view from ``poses`` (1, 4, 4)."""
+        slam, wanted = self._slam, np.ones(1, dtype=bool)
+        cutoff_m = slam.config.depth_cutoff_m
+        return measure_consistency(self._frames, poses, wanted, slam.aligner, cutoff_m)[0]
+
+    def verify(self, poses: Float64) -> bool:
+        """Whether the map's view from ``poses`` (1, 4, 4) is like the frame."""
+        slam, found = self._slam, np.ones(1, dtype=bool)
+        return bool(slam.relocalization.verify(self._frames, poses, found, slam.aligner)[0])
+
+    def propose(self, attempt: int) -> Float64 | None:
+        """A pose (4, 4) where the frame may have been taken, from keyframes; None without."""
+        slam, lost = self._slam, np.ones(1, dtype=bool)
+        attempts = np.array([attempt], dtype=np.int32)
+        poses = slam.relocalization.propose(self._frames, lost, attempts, slam.aligner)
+        return poses[0] if np.isfinite(poses).all() else None
+
+
+class MapFinder:
+    """Finds frames in maps that were put aside; nothing is fused."""
+
+    def __init__(self, slam: BatchedSurfelSlam) -> None:
+        self._present = slam
+        self._slam = BatchedSurfelSlam(1, slam.intrinsics, slam.config, slam.map.device)
+        self._loaded: DetachedMap | None = None
+
+    @property
+    def map(self) -> SurfelMap:
+        """The surfels of the map that was searched last."""
+        return self._slam.map
+
+    def keyframe_poses(self) -> Float64:
+        """Poses (K, 4, 4) of its keyframes."""
+        return self._slam.keyframe_poses()
+
+    def forget(self) -> None:
+        """Load a map anew next time."""
+        self._loaded = None
+
+    def dissimilarity(self, frames: Images, other: DetachedMap) -> float:
+        """Of a frame and the keyframe of a map that resembles it most; infinity: it has none."""
+        return self._present.relocalization.least_dissimilarity(0, frames, other.keyframes)
+
+    def near(self, frames: Images, other: DetachedMap, pose: Float64) -> Float64 | None:
+        """Where in a map a frame was taken if that is near ``pose`` (4, 4); None if it is not."""
+        lookup = self._lookup(other, frames)
+        found = lookup.align_near(pose)
+        if not found.tracked[0] or not lookup.verify(found.T_world_live):
+            return None
+        return found.T_world_live[0]
+
+    def anywhere(self, frames: Images, other: DetachedMap, attempt: int) -> Float64 | None:
+        """Where in a map a frame was taken, from keyframes that resemble it; None if none does."""
+        pose = self._lookup(other, frames).propose(attempt)
+        return None if pose is None else self.near(frames, other, pose)
+
+    def bears_out(self, slam: BatchedSurfelSlam, T_other_present: Float64, pose: Float64) -> bool:
+        """Whether the views of the map found last and of ``slam``'s agree on how the maps lie.
+
+        They are views from where cameras were, near ``pose`` (4, 4) in ``slam``'s map.
+        """
+        own = np.concatenate([slam.keyframe_poses(), pose[None]])
+        present = MapViews.of(slam.map, own, pose)
+        there = MapViews.of(self.map, self.keyframe_poses(), T_other_present @ pose)
+        fit = measure_fit(there, present, T_other_present, _FIT)
+        return not why_not_believed(fit)
+
+    def _lookup(self, other: DetachedMap, frames: Images) -> FrameLookup:
+        self._slam.reconfigure(self._present.config, self._present.intrinsics)
+        if self._loaded is not other:
+            self._slam.attach_map(other)
+            self._loaded = other
+        return FrameLookup(self._slam, frames)
+
+
+class JointSearch(Saved):
+    """How the present map lies relative to one of those put aside: the looks that agree on it."""
+
+    saved = ("_label", "_votes", "_frame", "_pose", "_looks")
+
+    def __init__(self) -> None:
+        self._label: int | None = None  # of the map put aside; None: nothing was found yet
+        self._votes: list[Float64] = []  # (4, 4) T_other_present of each look
+        self._frame: int | None = None  # of the last look
+        self._pose = np.eye(4)  # (4, 4) in the present map at the last look
+        self._looks = 0  # in vain, since the map was lost
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        like = {
+            "label": OrNone(WholeNumber(most="submaps")),
+            "votes": ListOf(np.eye(4)),
+            "frame": OrNone(WholeNumber()),
+        }
+        return Fields(super().state_like() | like, _why_no_search)
+
+    def is_due(self, frame: int, pose: Float64, rules: SubmapConfig) -> bool:
+        """Whether it is time for a look; the next one that may agree is from another place."""
+        if self._frame is None or frame - self._frame >= rules.interval:
+            return True
+        moved = not is_within(pose, self._pose, rules.step_m, np.radians(rules.step_deg))
+        return self._label is not None and moved
+
+    def look(
+        self,
+        frame: int,
+        pose: Float64,
+        frames: Images,
+        detached: Sequence[DetachedMap],
+        finder: MapFinder,
+        rules: SubmapConfig,
+    ) -> tuple[DetachedMap, Float64] | None:
+        """Look for the camera at ``pose`` (4, 4) in the maps put aside.
+
+        Returns:
+            The map and T_other_present (4, 4), once enough looks agree.
+        """
+        self._frame, self._pose = frame, pose.copy()
+        other, found = self._find(pose, frames, detached, finder, rules)
+        if other is None or found is None:
+            self._label, self._votes = None, []
+            self._looks += 1
+            return None
+        T_other_present = found @ invert(pose)
+        reach = rules.agreement_m, np.radians(rules.agreement_deg)
+        if self._votes and not is_within(found, self._votes[0] @ pose, *reach):
+            self._votes = []
+        self._label = other.label
+        self._votes.append(T_other_present)
+        if len(self._votes) < rules.looks:
+            return None
+        mean = mean_pose(np.stack(self._votes) @ pose)
+        self._label, self._votes = None, []
+        return other, mean @ invert(pose)
+
+    def _find(
+        self,
+        pose: Float64,
+        frames: Images,
+        detached: Sequence[DetachedMap],
+        finder: MapFinder,
+        rules: SubmapConfig,
+    ) -> tuple[DetachedMap | None, Float64 | None]:
+        expected = [each for each in detached if each.label == self._label]
+        if expected:
+            return expected[0], finder.near(frames, expected[0], self._votes[-1] @ pose)
+        dissimilar = [finder.dissimilarity(frames, each) for each in detached]
+        order = np.argsort(dissimilar, kind="stable")
+        which = int(order[self._looks % len(order)])
+        if dissimilar[which] > rules.dissimilarity:
+            which = int(order[0])
+        other = detached[which]
+        found = finder.near(frames, other, pose)
+        if found is None and dissimilar[which] <= rules.dissimilarity:
+            found = finder.anywhere(frames, other, self._looks)
+        return other, found
+
+
+def _why_no_search(state: dict[str, Any]) -> str:
+    """What is wrong between the label of a state and its votes."""
+    is_known = state["label"] is not None
+    return "" if is_known == bool(state["votes"]) else "has votes without a label, or a label alone"
+
+
+@dataclass(frozen=True)
+class MapViews:
+    """A map and what it shows from where cameras were, in the place of their frames."""
+
+    backend: SurfelMap
+    frames: list[RGBDFrame]  # N
+    estimates: Float64  # (N, 4, 4) T_map_camera
+    tracked: NDArray[np.bool_]  # (N,) all of them
+
+    @classmethod
+    def of(cls, surfel_map: SurfelMap, poses: Float64, here: Float64) -> MapViews:
+        """Views from those of the poses (K, 4, 4) that are nearest to one (4, 4)."""
+        distance = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
+        chosen = poses[np.argsort(distance, kind="stable")[: _FIT.queries]]
+        frames = _as_frames(surfel_map.predict(chosen))
+        return cls(surfel_map, frames, chosen, np.ones(len(chosen), dtype=bool))
+
+
+def _as_frames(views: Views) -> list[RGBDFrame]:
+    grey = np.rint(views.intensity).astype(np.uint8)[..., None].repeat(3, axis=-1)
+    return [RGBDFrame(color, depth) for color, depth in zip(grey, views.depth, strict=True)]
+
 
 CARRIED_ON = 0.95
 """From frame to frame, of the last motion, which is all that is known of a lost camera.
@@ -40,44 +248,17 @@ UNFORESEEN = 0.3
 """Standard deviation of a coordinate of that pose, in last motions, by every frame carried on."""
 
 
-class NoSubmaps(Saved):
-    """The variant "off": a lost camera stands still until it finds its map again."""
+class AtlasSubmaps(Saved):
+    """The submaps of a SLAM of one camera: one that is lost goes on in a new submap.
 
-    def __init__(self, slam: BatchedSurfelSlam) -> None:
-        self._slam = slam
-
-    def reset(self) -> None:
-        """Forget all submaps."""
-
-    def follow(self, frames: Images, guess: ArrayLike | None, result: TrackResult) -> TrackResult:
-        """Do what is to be done after a frame was tracked or not; the result to return for it."""
-        return result
-
-    def detached(self) -> Sequence[DetachedMap]:
-        """The maps put aside."""
-        return ()
-
-    @property
-    def present(self) -> int:
-        """Number of the submap that frames are tracked in."""
-        return 0
-
-    def trajectory(self) -> tuple[NDArray[np.int32], Float64]:
-        """Frames (N,) and their poses (N, 4, 4) as the maps have them now."""
-        return self._slam.loops.trajectory(0)
-
-    def summary(self) -> Submaps:
-        """The submaps as they hang together."""
-        return one_submap()
-
-
-class AtlasSubmaps(NoSubmaps):
-    """The variant "atlas": a lost camera goes on in a new submap."""
+    With ``SurfelConfig.submaps`` "off" it stands still until it finds its map again, the only one.
+    """
 
     saved = ("_ledger", "_search", "_present", "_refused", "_expected", "_motion")
 
     def __init__(self, slam: BatchedSurfelSlam) -> None:
-        super().__init__(slam)
+        self._slam = slam
+        self._is_on = slam.config.submaps == "atlas"
         self._finder: MapFinder | None = None  # made when there is something to find
         self.reset()
 
@@ -100,12 +281,15 @@ class AtlasSubmaps(NoSubmaps):
         """Number of the submap that frames are tracked in."""
         return self._present
 
+    @property
     def detached(self) -> Sequence[DetachedMap]:
         """The maps put aside."""
         return self._detached
 
     def trajectory(self) -> tuple[NDArray[np.int32], Float64]:
         """Frames (N,) and their poses (N, 4, 4) as the maps have them now."""
+        if not self._ledger.has_several:
+            return self._slam.loops.trajectory(0)
         poses: dict[int, Float64] = {}
         for frames, stack in (self._ledger.trajectory(), self._slam.loops.trajectory(0)):
             poses |= dict(zip(frames.tolist(), stack, strict=True))
@@ -120,7 +304,12 @@ class AtlasSubmaps(NoSubmaps):
     # -- After every frame ---------------------------------------------------------------------
 
     def follow(self, frames: Images, guess: ArrayLike | None, result: TrackResult) -> TrackResult:
-        """Start a submap after a few refused frames, look for older ones while there are any."""
+        """Start a submap after a few refused frames, look for older ones while there are any.
+
+        Returns the result for the frame that was just tracked or not.
+        """
+        if not self._is_on:
+            return result
         if not result.tracking_ok:
             return self._labelled(self._after_refusal(frames, guess, result))
         self._refused = 0
@@ -226,11 +415,15 @@ class AtlasSubmaps(NoSubmaps):
         return replace(result, T_world_camera=slam.poses[0].copy(), submaps_joined=True)
 
     def get_state(self) -> dict[str, Any]:
-        """Everything, as NumPy arrays and plain values."""
+        """Everything, as NumPy arrays and plain values; nothing with submaps "off"."""
+        if not self._is_on:
+            return {}
         return super().get_state() | {"detached": [each.get_state() for each in self._detached]}
 
     def state_like(self) -> Any:
         """See ``Stateful``."""
+        if not self._is_on:
+            return {}
         submap = WholeNumber(most="submaps")
         detached = {
             "surfels": self._slam.map.surfels_like(),
@@ -244,14 +437,11 @@ class AtlasSubmaps(NoSubmaps):
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state."""
+        if not self._is_on:
+            return
         super().set_state(state)
         self._detached = [DetachedMap() for _ in state["detached"]]
         for each, values in zip(self._detached, state["detached"], strict=True):
             each.set_state(values)
         if self._finder is not None:
             self._finder.forget()
-
-
-def make_submaps(slam: BatchedSurfelSlam) -> NoSubmaps:
-    """The variant ``config.submaps`` for a SLAM of one camera."""
-    return AtlasSubmaps(slam) if slam.config.submaps == "atlas" else NoSubmaps(slam)

@@ -19,43 +19,21 @@ class LoopConfig(Checked):
         window: frames for which a surfel that is not seen stays active.
         interval: frames between two looks for a loop.
         coverage: share of the image that the inactive part of the map must cover.
-        sigma: largest standard deviation (metres, radians) of the worst direction of the
-            registration of active and inactive part.
-        inliers: least share of matched points that the registration explains.
         largest_m: largest correction of the camera's position that is believed.
-        largest_deg: largest correction of its rotation.
         smallest_m: a correction that moves a point at 1 m less than this deforms nothing: the
             inactive surfels are taken back as they are.
-        agreement_m: a loop is closed when two looks agree so far on the correction, at 1 m.
         global_interval: frames between two looks at keyframes; a multiple of ``interval``.
-        dissimilarity: of a frame and a keyframe that may show the same place, share of the ferns.
         drift_share: a keyframe's place is believed if it is no further away than this share of the
             way since.
-        surfels_per_node: of the deformation graph.
-        max_nodes: of the deformation graph.
-        constraint_columns: the image is divided into so many columns, with rows as high as they
-            are wide; each cell gives one constraint and one pin.
-        error_m: largest RMS distance that the constraints may keep after the graph was optimised.
-        error_share: the same as a share of the distance before.
     """
 
     window: int = bounded(50, 1, 1_000_000)
     interval: int = bounded(5, 1, 10_000)
     coverage: float = bounded(0.25, 0.01, 1.0)
-    sigma: float = bounded(0.01, 1e-6, 1.0)
-    inliers: float = bounded(0.7, 0.0, 1.0)
     largest_m: float = bounded(0.3, 0.0, 100.0)
-    largest_deg: float = bounded(20.0, 0.0, 180.0)
     smallest_m: float = bounded(0.008, 0.0, 1.0)
-    agreement_m: float = bounded(0.01, 0.0, 1.0)
     global_interval: int = bounded(20, 1, 10_000)
-    dissimilarity: float = bounded(0.3, 0.0, 1.0)
     drift_share: float = bounded(0.15, 0.0, 10.0)
-    surfels_per_node: int = bounded(400, 10, 1_000_000)
-    max_nodes: int = bounded(100, 10, 10_000)
-    constraint_columns: int = bounded(16, 2, 100)
-    error_m: float = bounded(0.01, 0.0, 1.0)
-    error_share: float = bounded(0.3, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -70,14 +48,12 @@ class DoubtConfig(Checked):
         alike: least share of the textured points that are photometric inliers.
         conflicts: largest share of the matched points whose depth conflicts.
         cost: largest mean truncated cost of the visible points, in [0, 3].
-        longest: frames in a row that may be uncertain; after them tracking is lost.
     """
 
     inliers: float = bounded(0.55, 0.0, 1.0)
     alike: float = bounded(0.55, 0.0, 1.0)
     conflicts: float = bounded(0.3, 0.0, 1.0)
     cost: float = bounded(1.7, 0.0, 3.0)
-    longest: int = bounded(10, 0, 1_000_000)
 
 
 @dataclass(frozen=True)
@@ -100,8 +76,6 @@ class AcceptanceConfig(Checked):
         alike: least share of the textured points that are photometric inliers.
         conflicts: largest share of the matched points whose depth conflicts.
         cost: largest mean truncated cost of the visible points, in [0, 3].
-        sigma: largest standard deviation (metres, radians) of the worst direction that the view
-            constrains.
         doubted: laxer values, of frames that are looked at once more.
     """
 
@@ -115,7 +89,6 @@ class AcceptanceConfig(Checked):
     alike: float = bounded(0.7, 0.0, 1.0)
     conflicts: float = bounded(0.15, 0.0, 1.0)
     cost: float = bounded(1.4, 0.0, 3.0)
-    sigma: float = bounded(0.04, 1e-6, 10.0)
     doubted: DoubtConfig = field(default_factory=DoubtConfig)
 
 
@@ -189,7 +162,6 @@ class SurfelConfig(Checked):
         fusion_distance_m: largest distance along the ray between a reading and the surfel that
             it updates, at 1 m; grows with depth squared like the sensor's noise.
         fusion_angle_deg: largest angle between their normals.
-        bilateral_sigma_px: width of the bilateral depth filter in the image, pixels.
         bilateral_sigma_m: width of the filter in depth at 1 m; grows with depth squared.
         bilateral_radius_px: half-size of the filter's window, pixels.
         normal_edge_per_m: a jump of inverse depth between neighbours (of a 160-column image)
@@ -201,7 +173,6 @@ class SurfelConfig(Checked):
         cauchy_icp: scale of Cauchy's loss on geometric residuals, in units of that noise.
         cauchy_rgb: the same for photometric residuals.
         intensity_noise: standard deviation of a grey value, grey levels.
-        lateral_noise_px: standard deviation of the place at which it was sampled, pixels.
         points_per_level: the last iteration of tracking looks at about this many pixels; the
             others at three tenths of that.
         refuse_bad_fits: whether a frame that fits the map badly counts as lost and stays out of the
@@ -243,7 +214,6 @@ class SurfelConfig(Checked):
     unstable_window: int = bounded(200, 1, 100_000)
     fusion_distance_m: float = bounded(0.02, 0.0001, 1.0)
     fusion_angle_deg: float = bounded(45.0, 1.0, 90.0)
-    bilateral_sigma_px: float = bounded(1.5, 0.1, 20.0)
     bilateral_sigma_m: float = bounded(0.01, 0.0001, 1.0)
     bilateral_radius_px: int = bounded(2, 0, 10)
     normal_edge_per_m: float = bounded(0.03, 0.001, 10.0)
@@ -253,7 +223,6 @@ class SurfelConfig(Checked):
     cauchy_icp: float = bounded(2.0, 0.01, 1000.0)
     cauchy_rgb: float = bounded(1.0, 0.01, 1000.0)
     intensity_noise: float = bounded(0.5, 0.01, 255.0)
-    lateral_noise_px: float = bounded(0.3, 0.0, 100.0)
     points_per_level: int = bounded(5000, 100, 10_000_000)
     refuse_bad_fits: bool = True
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)

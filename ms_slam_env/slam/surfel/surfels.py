@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from ms_slam_env._runtime.warp import roomy_zeros, wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
+from ms_slam_env._runtime.warp import roomy_zeros
 from ms_slam_env.errors import InputError
 
 BLOCK_SIZE = wp.constant(128)
@@ -25,16 +26,16 @@ class Surfels:
     A surfel with confidence 0 is dead: it keeps its slot until the next compaction.
     """
 
-    position: wp.array2d(dtype=wp.vec3)
-    normal: wp.array2d(dtype=wp.vec3)
-    color: wp.array2d(dtype=wp.vec3)
-    radius: wp.array2d(dtype=wp.float32)
-    confidence: wp.array2d(dtype=wp.float32)
-    created: wp.array2d(dtype=wp.int32)
-    seen: wp.array2d(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
-    dead: wp.array(dtype=wp.int32)
-    dropped: wp.array(dtype=wp.int32)
+    position: wp.array2d[wp.vec3]
+    normal: wp.array2d[wp.vec3]
+    color: wp.array2d[wp.vec3]
+    radius: wp.array2d[wp.float32]
+    confidence: wp.array2d[wp.float32]
+    created: wp.array2d[wp.int32]
+    seen: wp.array2d[wp.int32]
+    count: wp.array[wp.int32]
+    dead: wp.array[wp.int32]
+    dropped: wp.array[wp.int32]
 
 
 COUNTERS = ("count", "dead", "dropped")
@@ -47,68 +48,68 @@ ATTRIBUTES = ("position", "normal", "color", "radius", "confidence", "created", 
 class VisibleList:
     """Surfels inside the frustum of one camera per env, with their camera-frame geometry."""
 
-    index: wp.array2d(dtype=wp.int32)
-    position: wp.array2d(dtype=wp.vec3)
-    normal: wp.array2d(dtype=wp.vec3)
-    radius: wp.array2d(dtype=wp.float32)
-    count: wp.array(dtype=wp.int32)
+    index: wp.array2d[wp.int32]
+    position: wp.array2d[wp.vec3]
+    normal: wp.array2d[wp.vec3]
+    radius: wp.array2d[wp.float32]
+    count: wp.array[wp.int32]
 
 
 @wp.struct
 class CullingBlocks:
     """Blocks of B maps: arrays (B, capacity / BLOCK_SIZE, rounded up)."""
 
-    low: wp.array2d(dtype=wp.vec3)  # lower corner of the bounding box, world frame
-    high: wp.array2d(dtype=wp.vec3)  # upper corner
+    low: wp.array2d[wp.vec3]  # lower corner of the bounding box, world frame
+    high: wp.array2d[wp.vec3]  # upper corner
     # frame that saw the block's longest unseen unstable surfel; the largest number if all are
     # stable or dead.
-    expiry: wp.array2d(dtype=wp.int32)
-    listed: wp.array2d(dtype=wp.int32)  # blocks that a camera may see
-    num_listed: wp.array(dtype=wp.int32)  # (B,) how many those are
-    bounded: wp.array(dtype=wp.int32)  # (B,) slots whose blocks have a box that holds
+    expiry: wp.array2d[wp.int32]
+    listed: wp.array2d[wp.int32]  # blocks that a camera may see
+    num_listed: wp.array[wp.int32]  # (B,) how many those are
+    bounded: wp.array[wp.int32]  # (B,) slots whose blocks have a box that holds
 
 
 @wp.struct
 class SplatFootprints:
     """The surfels of a list in the image, arrays (B, capacity), and those that meet a pixel."""
 
-    u: wp.array2d(dtype=wp.float32)  # column of the centre
-    v: wp.array2d(dtype=wp.float32)  # row of the centre
-    inverse: wp.array2d(dtype=wp.float32)  # inverse depth of the centre
-    slope_u: wp.array2d(dtype=wp.float32)  # change of inverse depth per column
-    slope_v: wp.array2d(dtype=wp.float32)  # change of inverse depth per row
-    rim: wp.array2d(dtype=wp.float32)  # squared radius, square metres
+    u: wp.array2d[wp.float32]  # column of the centre
+    v: wp.array2d[wp.float32]  # row of the centre
+    inverse: wp.array2d[wp.float32]  # inverse depth of the centre
+    slope_u: wp.array2d[wp.float32]  # change of inverse depth per column
+    slope_v: wp.array2d[wp.float32]  # change of inverse depth per row
+    rim: wp.array2d[wp.float32]  # squared radius, square metres
     # first column that the disc may cover; ``right``, ``top`` and ``bottom`` likewise.
-    left: wp.array2d(dtype=wp.int32)
-    right: wp.array2d(dtype=wp.int32)  # last column
-    top: wp.array2d(dtype=wp.int32)  # first row
-    bottom: wp.array2d(dtype=wp.int32)  # last row
-    drawn: wp.array2d(dtype=wp.int32)  # places in the list of the discs that may cover a pixel
-    num_drawn: wp.array(dtype=wp.int32)  # (B,) how many those are
+    left: wp.array2d[wp.int32]
+    right: wp.array2d[wp.int32]  # last column
+    top: wp.array2d[wp.int32]  # first row
+    bottom: wp.array2d[wp.int32]  # last row
+    drawn: wp.array2d[wp.int32]  # places in the list of the discs that may cover a pixel
+    num_drawn: wp.array[wp.int32]  # (B,) how many those are
 
 
 @wp.struct
 class Compaction:
-    """Working memory of ``surfel_culling``."""
+    """Working memory of ``surfel_map``."""
 
-    survivors: wp.array2d(dtype=wp.int32)  # (B, capacity) slots to keep
-    kept: wp.array(dtype=wp.int32)  # (B,) how many those are, -1 where no compaction is due
-    expired: wp.array(dtype=wp.int32)  # (B,) surfels that died just now
+    survivors: wp.array2d[wp.int32]  # (B, capacity) slots to keep
+    kept: wp.array[wp.int32]  # (B,) how many those are, -1 where no compaction is due
+    expired: wp.array[wp.int32]  # (B,) surfels that died just now
 
 
 @wp.struct
 class SurfelAges:
-    """How many unstable surfels of a crowded map are how old, see ``surfel_culling``."""
+    """How many unstable surfels of a crowded map are how old, see ``surfel_map``."""
 
-    count: wp.array2d(dtype=wp.int32)  # (B, NUM_AGES) the oldest first
+    count: wp.array2d[wp.int32]  # (B, NUM_AGES) the oldest first
 
 
 @wp.struct
 class SeenWindow:
     """Which surfels of B maps take part, by the frame that saw them last."""
 
-    seen_from: wp.array(dtype=wp.int32)  # (B,) first frame
-    seen_to: wp.array(dtype=wp.int32)  # (B,) last frame
+    seen_from: wp.array[wp.int32]  # (B,) first frame
+    seen_to: wp.array[wp.int32]  # (B,) last frame
 
 
 def any_time(batch: int, device: str) -> SeenWindow:
@@ -168,19 +169,19 @@ def default_workers(batch: int, device: str) -> int:
 
 
 @wp.func
-def rotation_of(T: wp.mat44):
+def rotation_of(T: wp.mat44) -> wp.mat33:
     """Rotation part of a rigid motion."""
     return wp.mat33(T[0, 0], T[0, 1], T[0, 2], T[1, 0], T[1, 1], T[1, 2], T[2, 0], T[2, 1], T[2, 2])
 
 
 @wp.func
-def translation_of(T: wp.mat44):
+def translation_of(T: wp.mat44) -> wp.vec3:
     """Translation part of a rigid motion."""
     return wp.vec3(T[0, 3], T[1, 3], T[2, 3])
 
 
 @wp.func
-def depth_tolerance(distance_at_1m: float, z: float):
+def depth_tolerance(distance_at_1m: float, z: float) -> float:
     """Allowed distance between two readings of one surface at depth z, metres.
 
     The axial noise of a structured-light sensor grows with z squared (Nguyen et al., 3DIMPVT

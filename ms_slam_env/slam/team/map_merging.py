@@ -30,6 +30,8 @@ from ms_slam_env.slam.team.relative_map_poses import (
 
 Float64 = NDArray[np.float64]
 
+AGREE_M, AGREE_DEG = 0.10, 5.0  # guesses agree that put robot b's cameras less than this apart
+LEAST_AGREEING, LEAST_SHARE = 3, 0.6  # guesses that must agree, and their share of all
 _SLACK = 0.01  # by which registration may worsen a share of pixels
 
 
@@ -42,10 +44,6 @@ class MergeConfig(FitConfig):
         queries: frames of each robot that are compared by their features, and judged by.
         lost_queries: places on each robot's path from where it is relocalised in the other's map.
         patience: consecutive frames tried at each.
-        agree_m: guesses that put robot b's cameras less than this apart agree,
-        agree_deg: and whose rotations differ by less than this.
-        least_agreeing: so many guesses must agree,
-        least_share: and be this share of all.
         voxel_m: thinning of the maps before they are registered.
         cutoff_m: farthest pair of points in the registration.
     """
@@ -54,10 +52,6 @@ class MergeConfig(FitConfig):
     queries: int = bounded(24, 1, 10_000)
     lost_queries: int = bounded(8, 1, 10_000)
     patience: int = bounded(4, 2, 1000)
-    agree_m: float = bounded(0.10, 1e-4, 10.0)
-    agree_deg: float = bounded(5.0, 1e-2, 180.0)
-    least_agreeing: int = bounded(3, 1, 10_000)
-    least_share: float = bounded(0.6, 0.0, 1.0)
     voxel_m: float = bounded(0.02, 1e-3, 1.0)
     cutoff_m: float = bounded(0.10, 1e-3, 10.0)
 
@@ -109,21 +103,21 @@ def decide(
     if not (a.tracked.any() and b.tracked.any()):
         return Merge(None, "a robot has tracked no frame")
     centre = b.estimates[b.tracked, :3, 3].mean(axis=0)
-    agreeing = consensus(hypotheses, centre, config.agree_m, config.agree_deg)
+    agreeing = consensus(hypotheses, centre, AGREE_M, AGREE_DEG)
     counts = len(hypotheses), len(agreeing)
-    if len(agreeing) < config.least_agreeing:
+    if len(agreeing) < LEAST_AGREEING:
         return Merge(None, "too few frames show the other map", *counts)
-    if len(agreeing) < config.least_share * len(hypotheses):
+    if len(agreeing) < LEAST_SHARE * len(hypotheses):
         return Merge(None, "the frames contradict each other", *counts)
     T_a_b, refined_m = mean_pose(agreeing, centre), 0.0
     fit = measure_fit(a, b, T_a_b, config)
     refined = refine(a, b, T_a_b, config)
     moved_m, moved_deg = pose_difference(refined, T_a_b, centre)
-    if moved_m < config.agree_m and moved_deg < config.agree_deg:
+    if moved_m < AGREE_M and moved_deg < AGREE_DEG:
         again = measure_fit(a, b, refined, config)
         if again.overlap >= fit.overlap - _SLACK and again.consistent >= fit.consistent - _SLACK:
             T_a_b, fit, refined_m = refined, again, moved_m
-    reason = why_not_believed(fit, config)
+    reason = why_not_believed(fit)
     if reason:
         return Merge(None, reason, *counts, fit)
     return Merge(T_a_b, "", *counts, fit, refined_m)

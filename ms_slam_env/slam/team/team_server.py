@@ -29,6 +29,13 @@ from ms_slam_env.slam.team.relative_map_poses import RobotRun
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
+AGREE_M, AGREE_DEG = 0.2, 5.0
+"""A keyframe found in another map farther than this from where the merged maps put it is left out.
+
+So is one that is turned by more.
+"""
+LEAST_SHARE = 0.6  # of a keyframe's points that must lie on the other map
+MATCH_M, MATCH_RAD = 0.01, 0.006  # error of a keyframe registered in another map
 _FAR_M = 4.0  # readings beyond are too noisy to be registered
 _VOXEL_M = 0.02
 _FEWEST, _MATCHED = 200, 800  # points that are registered
@@ -41,24 +48,13 @@ class ServerConfig(Checked):
 
     Attributes:
         keyframes: of each robot, evenly spread over its tracked frames.
-        agree_m: a keyframe found in another map farther than this from where the merged maps put
-            it,
-        agree_deg: or turned by more, is left out.
-        least_share: share of a keyframe's points that must lie on the other map.
         cutoff_m: farthest pair of points in the registration.
         drift: error of the motion between neighbouring keyframes, as a share of it.
-        match_m: error of a keyframe registered in another map, metres,
-        match_rad: and radians.
     """
 
     keyframes: int = bounded(30, 2, 1000)
-    agree_m: float = bounded(0.2, 1e-4, 10.0)
-    agree_deg: float = bounded(5.0, 1e-2, 180.0)
-    least_share: float = bounded(0.6, 0.0, 1.0)
     cutoff_m: float = bounded(0.04, 1e-3, 1.0)
     drift: float = bounded(0.003, 1e-6, 1.0)
-    match_m: float = bounded(0.01, 1e-6, 1.0)
-    match_rad: float = bounded(0.006, 1e-6, 1.0)
 
 
 @dataclass(frozen=True)
@@ -175,7 +171,7 @@ def _links(
             if T is not None:
                 a = _nearest(T, keyframes, robot)
                 motion = invert(keyframes[a].T_world_camera) @ T
-                found.append(Edge(a, b, motion, config.match_rad, config.match_m))
+                found.append(Edge(a, b, motion, MATCH_RAD, MATCH_M))
     return found
 
 
@@ -184,13 +180,13 @@ def _registered(seen: _Keyframe, points: Float64, config: ServerConfig) -> Float
     moved = transform_points(seen.T_world_camera, seen.cloud)
     if len(moved) < _FEWEST:
         return None
-    low, high = moved.min(axis=0) - config.agree_m, moved.max(axis=0) + config.agree_m
+    low, high = moved.min(axis=0) - AGREE_M, moved.max(axis=0) + AGREE_M
     around = points[((points > low) & (points < high)).all(axis=1)]
     if len(around) < _FEWEST:
         return None
     fit = register_clouds(moved, around, "gicp", config.cutoff_m, _MATCHED)
     T = fit.T_target_source @ seen.T_world_camera
-    near = fit.share >= config.least_share and _agree(T, seen.T_world_camera, config)
+    near = fit.share >= LEAST_SHARE and _agree(T, seen.T_world_camera)
     return T if near else None
 
 
@@ -201,10 +197,10 @@ def _nearest(T: Float64, keyframes: Sequence[_Keyframe], robot: int) -> int:
     return own[int(np.argmin(away))]
 
 
-def _agree(T: Float64, expected: Float64, config: ServerConfig) -> bool:
+def _agree(T: Float64, expected: Float64) -> bool:
     off = invert(expected) @ T
     turned = np.degrees(relative_angle(np.eye(3), off[:3, :3]))
-    return bool(np.linalg.norm(off[:3, 3]) <= config.agree_m and turned <= config.agree_deg)
+    return bool(np.linalg.norm(off[:3, 3]) <= AGREE_M and turned <= AGREE_DEG)
 
 
 def _carried_along(poses: Float64, at: Int64, corrections: Float64) -> Float64:

@@ -32,6 +32,8 @@ from ms_slam_env.slam.volumetric.projective_icp import (
 from ms_slam_env.slam.volumetric.volumetric_slam import FrameToModel, FusedImage, VolumetricSlam
 from ms_slam_env.slam.volumetric.voxel_grid import CastView, VolumetricConfig, VoxelGrid
 
+_COS_ANGLE = 0.8  # least, between the normals of corresponding points
+_LEAST_SHARE = 0.15  # of all pixels that must correspond; with fewer tracking is lost
 _EVERY_FRAME = 4  # frames that are fused whatever the rate, as in SLAMBench
 
 
@@ -46,10 +48,8 @@ class KinectFusionConfig(Checked):
         icp_threshold: length of a step (metres and radians) below which a level of ICP ends.
         iterations: of ICP at most, per pyramid level, finest first.
         integration_rate: every how many-th tracked frame is fused.
-        icp_distance_m: largest distance of corresponding points,
-        icp_cos_angle: least cosine of the angle between their normals.
-        track_threshold: share of all pixels that must correspond; with fewer tracking is lost,
-        track_residual_m: and so it is where their RMS distance from the model is larger.
+        icp_distance_m: largest distance of corresponding points.
+        track_residual_m: tracking is lost where their RMS distance from the model is larger.
         start_x: where in the cube the first camera stands, as shares of its edge, x right,
         start_y: y down,
         start_z: z forward. SLAMBench maps 4.8 m in 256 voxels, with the first camera at a side of
@@ -57,9 +57,6 @@ class KinectFusionConfig(Checked):
         depth_cutoff_m: readings beyond are ignored.
         least_weight: observations after which a voxel counts as surface, in predictions and in
             the surface points.
-        least_overlap: share of a frame's readings that the model's view must show,
-        least_inliers: share of those that must fit its depth,
-        least_alike: share of those that must fit its intensity.
         stock: as published: only SLAMBench's two rules decide, intensity plays no part, and no
             other pose than the last is tried.
     """
@@ -71,17 +68,12 @@ class KinectFusionConfig(Checked):
     iterations: tuple[int, ...] = (10, 5, 4)
     integration_rate: int = bounded(1, 1, 30)
     icp_distance_m: float = bounded(0.1, 0.01, 1.0)
-    icp_cos_angle: float = bounded(0.8, 0.0, 1.0)
-    track_threshold: float = bounded(0.15, 0.0, 1.0)
     track_residual_m: float = bounded(0.02, 0.001, 1.0)
     start_x: float = bounded(0.5, 0.0, 1.0)
     start_y: float = bounded(0.5, 0.0, 1.0)
     start_z: float = bounded(0.5, 0.0, 1.0)
     depth_cutoff_m: float = bounded(4.0, 0.1, LARGEST_CUTOFF_M)
     least_weight: int = bounded(1, 1, 1000)
-    least_overlap: float = bounded(0.3, 0.0, 1.0)
-    least_inliers: float = bounded(0.75, 0.0, 1.0)
-    least_alike: float = bounded(0.9, 0.0, 1.0)
     stock: bool = False
 
     def __post_init__(self) -> None:
@@ -106,7 +98,7 @@ class ProjectiveAlignment(FrameToModel):
 
     def __init__(self, intrinsics: Intrinsics, config: KinectFusionConfig) -> None:
         self._intrinsics, self._config = intrinsics, config
-        gates = config.icp_distance_m, config.icp_cos_angle
+        gates = config.icp_distance_m, _COS_ANGLE
         self._icp = ProjectiveICP(intrinsics, config.iterations, config.icp_threshold, *gates)
         self._frame: DepthImage | None = None
         self._pyramid: list[Surface] = []
@@ -119,7 +111,7 @@ class ProjectiveAlignment(FrameToModel):
         T, sums = self._icp.align(self._pyramid, model_surface(view, self._intrinsics))
         share = sums.inliers / frame.depth.size
         is_far = sums.residual_m > self._config.track_residual_m
-        return None if share < self._config.track_threshold or is_far else T
+        return None if share < _LEAST_SHARE or is_far else T
 
 
 class KinectFusionSlam(VolumetricSlam):

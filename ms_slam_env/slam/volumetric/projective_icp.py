@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.camera.frame import reduce_depth
 from ms_slam_env.geometry import Float64, se3_exp
@@ -79,20 +79,20 @@ def _normals(points: Float64, valid: Any) -> Float64:
 
 @wp.kernel
 def _accumulate(
-    live_points: wp.array2d(dtype=wp.vec3),
-    live_normals: wp.array2d(dtype=wp.vec3),
-    model_points: wp.array2d(dtype=wp.vec3),
-    model_normals: wp.array2d(dtype=wp.vec3),
+    live_points: wp.array2d[wp.vec3],
+    live_normals: wp.array2d[wp.vec3],
+    model_points: wp.array2d[wp.vec3],
+    model_normals: wp.array2d[wp.vec3],
     R: wp.mat33,
     t: wp.vec3,
     focal: wp.vec2,
     centre: wp.vec2,
     distance_m: float,
     cos_angle: float,
-    hessian: wp.array(dtype=wp.spatial_matrix),
-    gradient: wp.array(dtype=wp.spatial_vector),
-    counts: wp.array(dtype=wp.vec2),
-):
+    hessian: wp.array[wp.spatial_matrix],
+    gradient: wp.array[wp.spatial_vector],
+    counts: wp.array[wp.vec2],
+) -> None:
     """Sum the terms of one row; counts are inliers and their squared residuals."""
     row = wp.tid()
     H = wp.spatial_matrix()

@@ -20,8 +20,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.slam.odometry.odometry import Aligner
 from ms_slam_env.slam.shared.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, check_alignment
-from ms_slam_env.slam.shared.search_poses import motion_hypotheses
-from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam
+from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam, motion_hypotheses
 from ms_slam_env.slam.slam_backend import Float64, Views, check_views
 from ms_slam_env.slam.volumetric.voxel_grid import (
     DEPTH_SCALE,
@@ -33,6 +32,7 @@ from ms_slam_env.slam.volumetric.voxel_grid import (
 )
 
 _ITERATIONS = (10, 5, 3)  # coarse to fine
+_ASSOCIATION_M = 0.07  # largest difference of depth between associated points
 _STOCK_ITERATIONS = (6, 3, 1)
 
 
@@ -56,7 +56,7 @@ class Open3DAlignment(FrameToModel):
         self._odometry = grid.open3d.t.pipelines.odometry
         counts = _STOCK_ITERATIONS if grid.config.stock else _ITERATIONS
         self._criteria = [self._odometry.OdometryConvergenceCriteria(count) for count in counts]
-        self._loss = self._odometry.OdometryLossParams(grid.config.association_m)
+        self._loss = self._odometry.OdometryLossParams(_ASSOCIATION_M)
         self._start = grid.tensor(np.eye(4))
 
     def align(self, frame: DepthImage, view: CastView) -> Float64 | None:
@@ -126,7 +126,7 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
     def _assemble(self, grid: VoxelGrid, aligner: FrameToModel) -> None:
         """Start empty at the identity pose, with these parts and what ``config`` demands."""
         self._grid, self._aligner = grid, aligner
-        self._judge_views(self.config)
+        self._judge_views(self.config.stock)
         self._fresh = True  # whether the grid is as allocated
         super().__init__(grid.intrinsics)
 

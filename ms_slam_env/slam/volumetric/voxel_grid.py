@@ -27,7 +27,6 @@ STOCK: dict[str, Any] = {
     "blocks": 40_000,
     "truncation_voxels": 8.0,
     "aligner": "open3d",
-    "association_m": 0.07,
 }
 """Of Open3D's example; more iterations, a narrower truncation or association do not lower the error
 with noise."""
@@ -46,12 +45,8 @@ class VolumetricConfig(Checked):
         aligner: what aligns a frame with the model's view: ``opencv`` (the same result in every
             run) or ``open3d`` (what Open3D's dense SLAM has; runs differ in the last digits of
             every pose, and then by millimetres).
-        association_m: largest difference of depth between associated points, ``open3d`` only.
         least_weight: observations after which a voxel counts as surface, in predictions and in
             the surface points.
-        least_overlap: share of a frame's readings that the model's view must show,
-        least_inliers: share of those that must fit its depth,
-        least_alike: share of those that must fit its intensity.
         stock: Open3D's dense SLAM as it is, with the parameters of its own example
             ``dense_slam.py`` but for ``depth_cutoff_m`` and voxels of 1 cm, whatever the others
             say: nothing is checked, no other pose is tried, and a frame that cannot be aligned is
@@ -64,11 +59,7 @@ class VolumetricConfig(Checked):
     truncation_voxels: float = bounded(4.0, 1.0, 50.0)
     depth_cutoff_m: float = bounded(4.0, 0.1, LARGEST_CUTOFF_M)
     aligner: str = chosen("opencv", "opencv", "open3d")
-    association_m: float = bounded(0.07, 0.001, 1.0)
     least_weight: int = bounded(1, 1, 1000)
-    least_overlap: float = bounded(0.3, 0.0, 1.0)
-    least_inliers: float = bounded(0.75, 0.0, 1.0)
-    least_alike: float = bounded(0.9, 0.0, 1.0)
     stock: bool = False
 
     @property
