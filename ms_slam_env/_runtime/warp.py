@@ -10,13 +10,19 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.errors import InputError, InputWarning
+
+if TYPE_CHECKING:
+    kernel_wp: Any
+    """Warp where kernels are written: its 32-bit numbers are no types of Python's."""
+else:
+    kernel_wp = wp
 
 wp.config.log_level = wp.LOG_ERROR
 wp.config.enable_backward = False
@@ -191,4 +197,4 @@ class RecordedLaunch:
         self._pointers = ctypes.byref(bounds), ctypes.byref(self._packed)
 
 
-__all__ = ["HostDeviceBuffer", "RecordedLaunch", "roomy_zeros", "wp"]
+__all__ = ["HostDeviceBuffer", "RecordedLaunch", "kernel_wp", "roomy_zeros", "wp"]
