@@ -17,9 +17,9 @@ from ms_slam_experiments.shared.arm_truth import (
     furniture_cloud,
 )
 from ms_slam_experiments.shared.mask_tables import mask_tables
-from numpy.typing import NDArray
 
 from ms_slam_env import scenes as scene_library
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.benchmark.episodes import (
     DEFAULT_STEP_DEG,
@@ -46,8 +46,6 @@ DEFAULT_SCENES = ("window", "table", "wall", "carpet", "living_room")
 _START_TRIES = 20
 _RAY_STRIDE = 6  # pixels
 _JUDGED_POSTURES = 16  # along each attempted motion, its end included
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 from ms_slam_experiments.pictures.judged_map import save_map_picture
-from numpy.typing import NDArray
 
 from ms_slam_env import slam as slam_backends
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.episodes import check_names, seed_list
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import xtion
@@ -30,8 +30,6 @@ from ms_slam_env.report.tables import Grouping, Table
 from ms_slam_env.robot import FreeCamera
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor.scene_cache import get_sensor
-
-Float64 = NDArray[np.float64]
 
 IMAGE_SIZE = "160x120"
 MOTIONS = 40

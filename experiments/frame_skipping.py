@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.episode_scores import LOST_ERROR_M
 from ms_slam_env.benchmark.episodes import check_names, seed_list
 from ms_slam_env.benchmark.experiment import Experiment
@@ -27,8 +28,6 @@ from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, make_table
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import handheld_trajectory, icl_nuim, place_trajectory, render_sequence
-
-Float64 = NDArray[np.float64]
 
 _FINEST = 12  # denominator of an interval: 1.333 is 4/3
 HISTOGRAMS = {"default": DivergenceConfig(), "paper": DivergenceConfig.paper()}

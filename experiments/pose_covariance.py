@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from ms_slam_env import slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
@@ -26,8 +27,6 @@ from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.noise import noise_config
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import handheld_trajectory
-
-Float64 = NDArray[np.float64]
 
 DEGREES_OF_FREEDOM = 6
 BOUNDS = {"within_50": 0.5, "within_90": 0.9, "within_95": 0.95}

@@ -20,9 +20,9 @@ from ms_slam_experiments.shared.interruptions import (
     interrupt,
     map_path,
 )
-from numpy.typing import NDArray
 
 from ms_slam_env import scenes, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
@@ -39,8 +39,6 @@ from ms_slam_env.scenes import PUBLISHED_ROOMS, Scene
 from ms_slam_env.scenes.registry import check_name
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel.config import RELOCALISATIONS
-
-Float64 = NDArray[np.float64]
 
 EVERY = "all"
 COLUMNS = (

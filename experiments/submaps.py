@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 from ms_slam_experiments.shared.interruptions import FOREIGN, map_path
-from numpy.typing import NDArray
 
 from ms_slam_env import scenes, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
@@ -27,8 +27,6 @@ from ms_slam_env.report.tables import Table, Value, finished, make_table, summar
 from ms_slam_env.scenes import SCENES, Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel.config import SUBMAPS
-
-Float64 = NDArray[np.float64]
 
 RETURN, DARK = "return", "dark"
 KINDS = (RETURN, DARK, FOREIGN)

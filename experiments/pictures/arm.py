@@ -18,6 +18,7 @@ from ms_slam_experiments.shared.arm_truth import floor_below
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.config import Checked, bounded
@@ -29,8 +30,6 @@ from ms_slam_env.robot.arm.arm import KinematicArm
 from ms_slam_env.robot.arm.shape import Part, arm_parts, column_parts
 from ms_slam_env.scenes import Scene, TexturedMesh
 from ms_slam_env.sensor import RGBDSensor
-
-Float64 = NDArray[np.float64]
 
 _FILL = 1.25  # distance of the near view in diagonals of the box around the arm
 _FARTHER_M = 0.9  # the far view

@@ -9,12 +9,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Image
 from ms_slam_env._runtime.command_line import exit_code, parse
 from ms_slam_env._runtime.output_files import check_out_file, write_bytes
-
-Image = NDArray[np.uint8]
 
 BORDER, TITLE = 4, 18  # pixels
 

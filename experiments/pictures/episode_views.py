@@ -9,6 +9,7 @@ import numpy as np
 from ms_slam_experiments.pictures.drawing import Image
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.env.planners import Planner, goal_of
 from ms_slam_env.env.rendering import PANEL, caption, draw_color, draw_depth
 from ms_slam_env.env.third_person_view import (
@@ -26,7 +27,6 @@ from ms_slam_env.scenes.base import Scene, floor_height
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
-Float64 = NDArray[np.float64]
 
 _SIZE = (560, 480)  # width and height of the map
 _MARGIN_M = 0.2

@@ -10,16 +10,15 @@ import matplotlib
 import numpy as np
 from ms_slam_experiments.pictures.drawing import Image
 from ms_slam_experiments.shared.teams import Team
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.env.point_renderer import render_points
 from ms_slam_env.evaluation.duplicate_objects import JudgedMap
 from ms_slam_env.geometry import invert, look_at, transform_points
 from ms_slam_env.geometry.point_clouds import voxel_firsts
 from ms_slam_env.report.figures import caption, colour, new_figure, save
-
-Float64 = NDArray[np.float64]
 
 CAMERA = Intrinsics(fx=460.0, fy=460.0, cx=319.5, cy=239.5, width=640, height=480)
 RED = (225, 30, 30)

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.report.figures import caption, new_figure, save
 from ms_slam_env.scenes import Scene
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
-
-Float64 = NDArray[np.float64]
 
 BAND_M = (0.9, 1.5)  # heights shown: walls and furniture, neither floor nor ceiling
 NEW_FRAMES = 40  # surfels younger than this are the present part

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, make_pose, transform_points
 from ms_slam_env.robot.arm import ArmModel
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sensor import RGBDSensor
-
-Float64 = NDArray[np.float64]
 
 FAR_M = 0.1
 """Gaps are exact up to this; what is farther away counts as this far."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.geometry import invert, make_pose, relative_angle, so3_exp, transform_points
@@ -17,8 +17,6 @@ from ms_slam_env.scenes import Scene
 from ms_slam_env.sensor import FRAME_RATE_HZ, RGBDSensor
 from ms_slam_env.sequences import handheld_trajectory
 from ms_slam_env.slam import SlamBackend
-
-Float64 = NDArray[np.float64]
 
 DEPTH_LIMIT_M = 3.0  # readings beyond count neither as mapped nor as not
 FOUND_M, FOUND_DEG = 0.05, 5.0

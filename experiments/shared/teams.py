@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, scenes, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import map_quality
@@ -29,8 +30,6 @@ from ms_slam_env.slam.map_merging import (
     pose_difference,
 )
 from ms_slam_env.slam.team_server import fuse_team, optimise_team
-
-Float64 = NDArray[np.float64]
 
 SHARED, FOREIGN = "shared", "foreign"
 SETTINGS = (SHARED, FOREIGN)

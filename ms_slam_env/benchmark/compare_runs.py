@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.command_runs import run_command
 from ms_slam_env.config import parse_named
 from ms_slam_env.errors import InputError
@@ -21,8 +22,6 @@ from ms_slam_env.evaluation.trajectory_files import tracked_beside
 from ms_slam_env.geometry import invert
 from ms_slam_env.sequences import HandheldPath, Sequence, associate, read_trajectory
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S
-
-Float64 = NDArray[np.float64]
 
 MAP_METRICS = (
     *("map_error_median_m", *share_keys(THRESHOLDS_M, ("precision", "f_score"))),

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 import ms_slam_env
 from ms_slam_env import slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import Checked, bounded, chosen, nested_options
 from ms_slam_env.env import Planner
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
@@ -27,7 +27,6 @@ from ms_slam_env.tasks import find_task
 if TYPE_CHECKING:
     from ms_slam_env.env import ActiveSlamEnv
 
-Float64 = NDArray[np.float64]
 
 DEFAULT_PLANNERS = ("random", "stationary", "greedy", "max-information")
 DEFAULT_SCENES = ("living_room", "corridor", "table", "wall")

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
-from numpy.typing import NDArray
 
 from ms_slam_env import slam
 from ms_slam_env._runtime.parallel import limit_threads, thread_environment
@@ -22,8 +20,6 @@ from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, measured
 from ms_slam_env.sequences.usme_suite import NAMES, SUITE, find, made_with
-
-Float64 = NDArray[np.float64]
 
 TABLES: Mapping[str, tuple[str, ...]] = {
     "Accuracy": (

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, scenes, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import parse_named
 from ms_slam_env.errors import InputError
@@ -25,7 +26,6 @@ from ms_slam_env.sequences.usme_suite import UsmeSequence, find, render
 if TYPE_CHECKING:
     from ms_slam_env.sequences import RenderedSequence
 
-Float64 = NDArray[np.float64]
 
 LARGE_OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "surfel": {

@@ -12,12 +12,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import RecordedLaunch
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
 from ms_slam_env.scenes.base import Scene
-
-Float64 = NDArray[np.float64]
 
 _STRIDE = 2  # every second pixel in each direction marks coverage
 

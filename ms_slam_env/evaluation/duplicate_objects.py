@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.evaluation.map_truth import SURFACE_SPACING_M
 from ms_slam_env.geometry.point_clouds import voxel_firsts
 from ms_slam_env.metrics.consistency import (
@@ -24,8 +25,6 @@ from ms_slam_env.metrics.consistency import (
 from ms_slam_env.scenes.mesh_queries import sample_surface
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene
-
-Float64 = NDArray[np.float64]
 
 MAP_VOXEL_M = 0.01
 

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
 from ms_slam_env.geometry import invert, relative_angle, transform_points
 from ms_slam_env.sequences import Sequence
-
-Float64 = NDArray[np.float64]
 
 MOTIONS = ("turn_deg_s", "speed_m_s", "image_motion_deg_s")
 """Columns of `frame_motion`."""

@@ -12,13 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Bool, Float64, Int32
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.evaluation.seen_surface import back_projected
-from ms_slam_env.geometry import Float64, invert, relative_angle
+from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.base import Loop
-
-Int32 = NDArray[np.int32]
-Bool = NDArray[np.bool_]
 
 WRONG_M, WRONG_DEG = 0.05, 3.0
 """A closure is wrong if it leaves new and old map further apart than this."""

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Bool
 from ms_slam_env.sequences.rendering import RenderedFrames
 from ms_slam_env.slam.base import TrackResult
-
-Bool = NDArray[np.bool_]
 
 
 def true_masks(frames: RenderedFrames) -> Bool:

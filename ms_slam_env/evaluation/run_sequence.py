@@ -29,6 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.progress import Bar
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.errors import InputError
@@ -36,8 +37,6 @@ from ms_slam_env.metrics.cost import CostMeter
 from ms_slam_env.metrics.cost.meter import FrameCost
 from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.slam.base import SlamBackend, TrackResult
-
-Float64 = NDArray[np.float64]
 
 Track = Callable[[RGBDFrame], TrackResult]
 

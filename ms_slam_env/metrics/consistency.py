@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from ms_slam_env._runtime.arrays import Bool, Float64, Int64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, check_pose, invert, transform_points
+from ms_slam_env.geometry import check_pose, invert, transform_points
 from ms_slam_env.geometry.point_clouds import check_points
-
-Int64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -150,8 +149,6 @@ def distinct_placements(
             placed.append(moved)
     return np.stack(found)
 
-
-Bool = NDArray[np.bool_]
 
 _POINTS_TO_PLACE = 1500  # of an object, evenly picked, decide where it fits best
 

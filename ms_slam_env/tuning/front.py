@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.tuning.objectives import METRICS
 from ms_slam_env.tuning.study_storage import StudyStorage
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

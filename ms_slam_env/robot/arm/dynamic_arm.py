@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
-from ms_slam_env.geometry import Float64, relative_angle, transform_points
+from ms_slam_env.geometry import relative_angle, transform_points
 from ms_slam_env.robot.arm.arm import ArmEmbodiment, frame_times
 from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.controller import Controller, Plan, checked_ticks

@@ -7,9 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import Float64, look_at
+from ms_slam_env.geometry import look_at
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sequences.paths.base import CameraPath, frame_times, hand_tremor, resample, unit
 from ms_slam_env.sequences.paths.wandering import RADIUS_M
