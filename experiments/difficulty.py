@@ -26,6 +26,7 @@ from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import XTION_SIZES
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig
+from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.image_motion import MOTIONS, WatchedSequence, by_second, watch_frames
 from ms_slam_env.evaluation.sequence_divergence import KINDS, statistics_of
 from ms_slam_env.metrics.registry import metric
@@ -89,9 +90,9 @@ class Difficulty(Checked, Experiment):
     camera sees differs from place to place.
     """
 
-    data: Path = Path("../shared/data")
+    data: Path | None = None
     """Folder that holds icl_nuim/trajectories/lr_kt0.tum.txt and so on, and lr_kt3_depth."""
-    scenes: tuple[str, ...] = ("living_room", "../shared/data/small_house.glb,up=z")
+    scenes: tuple[str, ...] = ("living_room",)
     """Names of scenes, or mesh files."""
     motions: tuple[str, ...] = ("lr_kt0", "lr_kt1", "lr_kt2", "lr_kt3")
     """Files of the trajectories, without .tum.txt."""
@@ -120,6 +121,8 @@ class Difficulty(Checked, Experiment):
         Raises:
             InputError: a scene, trajectory or recording that cannot be read, or no place.
         """
+        if self.data is None:
+            raise InputError("--data is missing: the folder that holds icl_nuim")
         data, size, every = str(self.data), self.image_size, self.every
         times, together = icl_nuim.read_motions(data, self.motions)
         scale = min(

@@ -97,7 +97,7 @@ class FrameSkipping(Experiment):
     """Length of a whole sequence at most; hand-held, at most 1.5 cm and 1 degree a frame."""
     motions: tuple[str, ...] = ()
     """Motions of ICL-NUIM in place of hand-held ones, such as lr_kt1 lr_kt2."""
-    data: Path = Path("../shared/data")
+    data: Path | None = None
     """Folder that holds icl_nuim/trajectories/lr_kt1.tum.txt and so on."""
     sequences: int = 4
     """Sequences for each scene."""
@@ -129,6 +129,8 @@ class FrameSkipping(Experiment):
     def specs(self) -> list[SkippingSpec]:
         """Every sequence at every interval."""
         check_names(("random",), self.scenes)
+        if self.motions and self.data is None:
+            raise InputError("--motions needs --data, the folder that holds icl_nuim")
         for motion in self.motions:
             icl_nuim.read_motion(str(self.data), motion)  # refuses what is not there
         data = str(self.data) if self.motions else ""
