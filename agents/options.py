@@ -8,7 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from ms_slam_env._runtime.command_line import parse
 from ms_slam_env._runtime.input_files import read_text
 from ms_slam_env.config import Checked, bounded, chosen, from_dict, load_yaml
 from ms_slam_env.env.registry import POINT as OBSERVATIONS
@@ -178,17 +177,6 @@ class PpoTraining(Training):
 
 TASKS = Path(__file__).parent / "hyperparameters"
 P = TypeVar("P", bound=Problem)
-
-
-def parse_for_task(cls: type[P], arguments: Sequence[str], prog: str, trainer: str) -> P:
-    """Options ``cls`` of a command line; what it does not say is as its ``--task`` has it.
-
-    Raises:
-        InputError: bad options, an unknown task, or a file with an option that there is not.
-    """
-    task = named_in(arguments).get("task")
-    default = of_task(cls, task, trainer) if task else None
-    return parse(cls, arguments, prog, default=default)
 
 
 def named_in(arguments: Sequence[str]) -> dict[str, str]:

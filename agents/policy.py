@@ -13,10 +13,10 @@ from ms_slam_agents.policy_file import CONVOLUTIONS, Metadata, PolicyFile, read_
 from numpy.typing import NDArray
 
 import ms_slam_env
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError, unknown
 
 Actions = NDArray[np.int64]  # (B,), or (B, numbers) where each action has several
-Float64 = NDArray[np.float64]
 
 EPSILON = 1e-8  # keeps observations that never change finite
 CLIP = 10.0  # standard deviations

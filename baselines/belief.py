@@ -6,10 +6,10 @@ import math
 from typing import Any
 
 import numpy as np
-from ms_slam_baselines.goal_planner import Float64
 from ms_slam_baselines.nbv import NextBestView
 from ms_slam_baselines.view_goals import poses_between
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.geometry import adjoint, hat, invert
 from ms_slam_env.planning import view_information
 from ms_slam_env.planning.trackability import SCALE, mean_depth, risk_of

@@ -9,6 +9,7 @@ import numpy as np
 from ms_slam_baselines.greedy import distance_to_targets
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import check_range, check_whole
 from ms_slam_env.env import Planner
 from ms_slam_env.env.config import RewardConfig
@@ -17,7 +18,6 @@ from ms_slam_env.errors import unknown
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
-Float64 = NDArray[np.float64]
 
 ORDERS = ("random", "greedy")
 TERMS = tuple(field.name for field in fields(RewardConfig))

@@ -10,6 +10,7 @@ import numpy as np
 from ms_slam_baselines.view_goals import views_anywhere
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import check_range, check_whole
 from ms_slam_env.env import Planner
 from ms_slam_env.geometry import look_at, make_pose
@@ -19,7 +20,6 @@ from ms_slam_env.planning.view_goals import distance_in_steps
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
-Float64 = NDArray[np.float64]
 
 ARRIVED = 3  # steps from a goal
 KEPT_AWAY = 0.7  # steps from where tracking was lost

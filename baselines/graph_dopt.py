@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from ms_slam_baselines.belief import d_optimality
-from ms_slam_baselines.goal_planner import Float64
 from ms_slam_baselines.nbv import NextBestView
 from ms_slam_baselines.view_goals import frontiers, poses_between, views_of
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.planning.view_goals import distance_in_steps

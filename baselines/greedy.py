@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import check_range
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env import Planner
@@ -18,7 +18,6 @@ from ms_slam_env.errors import InputError, unknown
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
-Float64 = NDArray[np.float64]
 
 PRESETS = ("environment", "paper")
 PAPER_LOOKAHEAD = LookaheadConfig(reference="live", scale=1.0)

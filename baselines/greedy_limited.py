@@ -10,6 +10,7 @@ from ms_slam_baselines.goal_planner import GoalPlanner
 from ms_slam_baselines.greedy import distance_to_targets
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.divergence import make_divergence
 from ms_slam_env.planning.trackability import SCALE
 from ms_slam_env.planning.view_goals import distance_in_steps
@@ -17,7 +18,6 @@ from ms_slam_env.planning.view_goals import distance_in_steps
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
-Float64 = NDArray[np.float64]
 
 _EMPTY_NATS = np.array([0.4, 0.8])
 """Divergence met, of intensity and depth, for each share of a view that the map leaves empty.

@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ms_slam_baselines.nbv import NextBestView
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.planning import held_gain
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
-Float64 = NDArray[np.float64]
 
 _CHOICE = 0.05  # of what the best motion shows: so much less, and a motion is 1/e as good a choice
 

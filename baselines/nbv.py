@@ -9,6 +9,7 @@ import numpy as np
 from ms_slam_baselines.goal_planner import GoalPlanner
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.planning import expected_gain
 from ms_slam_env.planning.trackability import SCALE, bearable, follow_risks, leads_on
 from ms_slam_env.planning.view_goals import distance_in_steps
@@ -16,7 +17,6 @@ from ms_slam_env.planning.view_goals import distance_in_steps
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
-Float64 = NDArray[np.float64]
 
 _FAR_APART_RAD = math.radians(16)
 """Motions by more than this lead to views of which none shows what all of them show: each is then

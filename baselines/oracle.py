@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ms_slam_baselines.held_nbv import HeldNextBestView
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Bool, Float32, Float64
 from ms_slam_env.config import check_choice
 from ms_slam_env.evaluation.map_truth import reference_surface
 from ms_slam_env.planning.expected_gain import held_ways
@@ -17,9 +17,6 @@ from ms_slam_env.tasks import REFERENCES
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
-Float64 = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Bool = NDArray[np.bool_]
 
 _NEAREST_M, _FARTHEST_M = 0.3, 4.0  # of what a frame maps well
 _SLACK = 0.01  # share of its distance by which a point may lie behind what hides it

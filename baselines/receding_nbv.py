@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from ms_slam_baselines.nbv import NextBestView
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.planning.view_goals import best_goal
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
-
-Float64 = NDArray[np.float64]
 
 
 class RecedingNextBestView(NextBestView):

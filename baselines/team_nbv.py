@@ -9,6 +9,7 @@ import numpy as np
 from ms_slam_baselines.nbv import NextBestView
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import check_range
 from ms_slam_env.planning import OccupancyGrid
 
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from ms_slam_env.camera import Intrinsics
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
-Float64 = NDArray[np.float64]
 
 _LOOK_M = 1.5  # in front of a goal: what it is there to see
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.geometry import look_at, make_pose, so3_exp, so3_log
 from ms_slam_env.planning import OccupancyGrid
 from ms_slam_env.planning.view_goals import upright_poses
-
-Float64 = NDArray[np.float64]
 
 _PITCH_RAD = 0.7
 

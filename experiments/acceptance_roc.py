@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import mannwhitneyu
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.config import Checked, bounded
@@ -28,8 +28,6 @@ from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds, is_nearly_accepted
 from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.submaps import FrameLookup
-
-Float64 = NDArray[np.float64]
 
 RIGHT_M, RIGHT_RAD = 0.02, 0.02
 WRONG_M, WRONG_RAD = 0.05, 0.05

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, xtion
@@ -47,8 +48,6 @@ METRICS = (
     *("processed_share", "lost_share", "cpu_quiet_ms", "cpu_violent_ms"),
 )
 _SMALLEST_CHANGE = 1e-4  # nats; what is below is drawn there
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

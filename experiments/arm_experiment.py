@@ -18,8 +18,9 @@ from ms_slam_experiments.shared.duplicate_objects import (
     judge_map,
     labelled_view,
 )
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64, Image
 from ms_slam_env.benchmark.episode_scores import LOST_ERROR_M, measure_trajectory
 from ms_slam_env.benchmark.episodes import (
     DEFAULT_PLANNERS,
@@ -46,9 +47,6 @@ from ms_slam_env.report.charts import Chart, bars
 from ms_slam_env.report.figures import caption, new_figure, save
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, finished, make_table
-
-Float64 = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 SCENES = ("window", "table", "wall", "carpet")
 FRAME_RATE_HZ = 30  # no motion is shorter than a frame of the fastest camera

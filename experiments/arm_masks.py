@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ms_slam_env import scenes as scene_library
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.benchmark.episodes import (
     DEFAULT_STEP_DEG,
@@ -37,7 +38,6 @@ from ms_slam_env.robot.arm.feasibility import REASONS
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sensor import RGBDSensor
 
-Float64 = NDArray[np.float64]
 A = TypeVar("A", bound=ArmEmbodiment)
 
 DEFAULT_SCENES = ("window", "table", "wall", "carpet", "living_room")

@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 from ms_slam_experiments.shared import icl_nuim
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig
+from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.sequence_divergence import KINDS, consecutive_divergences, statistics_of
 from ms_slam_env.geometry import invert, relative_angle, transform_points
 from ms_slam_env.metrics.registry import metric
@@ -31,8 +32,6 @@ from ms_slam_env.sensor.noise import noise_config
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import Sequence as RGBDSequence
 from ms_slam_env.sequences import place_trajectory, render_sequence
-
-Float64 = NDArray[np.float64]
 
 HISTOGRAMS = {"paper": DivergenceConfig.paper(), "default": DivergenceConfig()}
 PAPER = {
@@ -85,9 +84,9 @@ class Difficulty(Checked, Experiment):
     camera sees differs from place to place.
     """
 
-    data: Path = Path("../shared/data")
+    data: Path | None = None
     """Folder that holds icl_nuim/trajectories/lr_kt0.tum.txt and so on, and lr_kt3_depth."""
-    scenes: tuple[str, ...] = ("living_room", "../shared/data/small_house.glb,up=z")
+    scenes: tuple[str, ...] = ("living_room",)
     """Names of scenes, or mesh files."""
     motions: tuple[str, ...] = ("lr_kt0", "lr_kt1", "lr_kt2", "lr_kt3")
     """Files of the trajectories, without .tum.txt."""
@@ -116,6 +115,8 @@ class Difficulty(Checked, Experiment):
         Raises:
             InputError: a scene, trajectory or recording that cannot be read, or no place.
         """
+        if self.data is None:
+            raise InputError("--data is missing: the folder that holds icl_nuim")
         data, size, every = str(self.data), self.image_size, self.every
         times, together = icl_nuim.read_motions(data, self.motions)
         scale = min(

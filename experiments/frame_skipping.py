@@ -14,6 +14,7 @@ from ms_slam_experiments.shared import icl_nuim
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.episode_scores import LOST_ERROR_M
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment
@@ -27,8 +28,6 @@ from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, make_table
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import handheld_trajectory, place_trajectory, render_sequence
-
-Float64 = NDArray[np.float64]
 
 _FINEST = 12  # denominator of an interval: 1.333 is 4/3
 HISTOGRAMS = {"default": DivergenceConfig(), "paper": DivergenceConfig.paper()}
@@ -98,7 +97,7 @@ class FrameSkipping(Experiment):
     """Length of a whole sequence at most; hand-held, at most 1.5 cm and 1 degree a frame."""
     motions: tuple[str, ...] = ()
     """Motions of ICL-NUIM in place of hand-held ones, such as lr_kt1 lr_kt2."""
-    data: Path = Path("../shared/data")
+    data: Path | None = None
     """Folder that holds icl_nuim/trajectories/lr_kt1.tum.txt and so on."""
     sequences: int = 4
     """Sequences for each scene."""
@@ -125,6 +124,8 @@ class FrameSkipping(Experiment):
 
     def specs(self) -> list[SkippingSpec]:
         """Every sequence at every interval."""
+        if self.motions and self.data is None:
+            raise InputError("--motions needs --data, the folder that holds icl_nuim")
         for motion in self.motions:
             icl_nuim.read_motion(str(self.data), motion)  # refuses what is not there
         return self.each(

@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from ms_slam_env import slam as slam_backends
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame, intensity_image, xtion
@@ -34,8 +34,6 @@ from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import handheld_trajectory
-
-Float64 = NDArray[np.float64]
 
 WARM_UP_FRAMES = 12  # before the first state, so that there is a map
 FRAMES_BETWEEN_STATES = 6

@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env import scenes
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
@@ -26,8 +26,6 @@ from ms_slam_env.robot.action_primitives import NUM_MOTIONS, decompose
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import handheld_trajectory
 from ms_slam_env.slam.surfel import SurfelSlam
-
-Float64 = NDArray[np.float64]
 
 STAGES = {
     "cull the surfels": ("rendering.py", "cull"),

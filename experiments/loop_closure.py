@@ -16,6 +16,7 @@ from ms_slam_experiments.shared.loop_paths import PATHS, returning_path
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, scenes, sensor, sequences
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import from_dict, nested_options
@@ -32,8 +33,6 @@ from ms_slam_env.report.tables import Table, finished, make_table, measured, sum
 from ms_slam_env.scenes import Scene
 from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
-
-Float64 = NDArray[np.float64]
 
 VARIANTS = ("none", "deformation")
 DEFAULT_RECORDINGS = (

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env import metrics, sequences, slam
+from ms_slam_env._runtime.arrays import Bool
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.config import Checked, bounded, parse_named
 from ms_slam_env.errors import InputError
@@ -199,9 +199,6 @@ def _picture(sequence: sequences.RenderedSequence) -> np.ndarray:
         tiles.append(cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(255,) * 3))
     rows = [np.hstack(tiles[k : k + _PER_ROW]) for k in range(0, _SHOWN, _PER_ROW)]
     return np.vstack(rows)
-
-
-Bool = NDArray[np.bool_]
 
 
 def true_masks(frames: RenderedFrames) -> Bool:

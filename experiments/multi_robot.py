@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, scenes, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.camera import xtion
@@ -44,8 +45,6 @@ from ms_slam_env.slam.team.map_merging import (
 )
 from ms_slam_env.slam.team.relative_map_poses import RobotRun
 from ms_slam_env.slam.team.team_server import fuse_team, optimise_team
-
-Float64 = NDArray[np.float64]
 
 SHARED, FOREIGN = "shared", "foreign"
 SETTINGS = (SHARED, FOREIGN)

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ms_slam_env import scenes, sequences, slam
 from ms_slam_env import sensor as sensors
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
@@ -22,8 +23,6 @@ from ms_slam_env.geometry import invert, se3_log
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, format_number, make_table
-
-Float64 = NDArray[np.float64]
 
 DEGREES_OF_FREEDOM = 6
 BOUNDS = {"within_50": 0.5, "within_90": 0.9, "within_95": 0.95}

@@ -9,9 +9,9 @@ from itertools import cycle
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env import metrics, scenes, sensor, sequences, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
@@ -26,8 +26,6 @@ from ms_slam_env.report.statistics import median_interval
 from ms_slam_env.report.tables import Table, Value, finished, format_value, make_table, summary
 from ms_slam_env.scenes import PUBLISHED_ROOMS, Scene
 from ms_slam_env.slam import SlamBackend
-
-Float64 = NDArray[np.float64]
 
 DEPTH_LIMIT_M = 3.0  # readings beyond count neither as mapped nor as not
 FOUND_M, FOUND_DEG = 0.05, 5.0

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env import metrics, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.parallel import limit_threads
 from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.camera import RGBDFrame, parse_image_size
 from ms_slam_env.camera.image_size import NATIVE
 from ms_slam_env.config import Checked, bounded, parse_named
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, summary

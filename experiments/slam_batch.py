@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import xtion
@@ -23,8 +24,6 @@ from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table
 from ms_slam_env.sequences import handheld_trajectory, render_sequence
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
-
-Float64 = NDArray[np.float64]
 
 COLUMNS = (
     *("device", "batch", "frames_per_s", "frames_per_cpu_s", "batch_ms", "mb_per_env"),

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 from ms_slam_experiments.relocalization import FOREIGN, map_path
-from numpy.typing import NDArray
 
 from ms_slam_env import metrics, scenes, slam
 from ms_slam_env import sensor as sensors
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment, check_each, check_names
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
@@ -27,8 +27,6 @@ from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, Value, finished, make_table, summary
 from ms_slam_env.scenes import SCENES, Scene
 from ms_slam_env.slam.surfel.surfel_config import SUBMAPS
-
-Float64 = NDArray[np.float64]
 
 RETURN, DARK = "return", "dark"
 KINDS = (RETURN, DARK, FOREIGN)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env import metrics
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.episodes import (
     DEFAULT_STEP_DEG,
     DEFAULT_STEP_M,
@@ -29,8 +29,6 @@ from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Grouping, Table, finished, make_table
 from ms_slam_env.scenes import HOMES, Scene
 from ms_slam_env.tasks import find_task
-
-Float64 = NDArray[np.float64]
 
 PLANNER = "ms_slam_baselines.team_nbv:TeamNextBestView"
 METRICS = (

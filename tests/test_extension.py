@@ -207,6 +207,13 @@ def test_a_planner_is_checked_by_its_name(module):
     assert experiment_class(f"{MODULE}:Brightness") is module.Brightness
 
 
+def test_the_current_folder_hides_no_other_module(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    assert check_planner(f"{MODULE}:AlwaysForward") is None
+    assert sys.path[-1] == str(folder)
+
+
 def test_the_command_line_runs_an_experiment_in_workers_with_everything(folder, tmp_path):
     """Module, scene and perturbation are found in the current folder alone."""
     environment = {**os.environ, "MS_SLAM_METRICS": f"{MODULE}:brightness_metrics"}

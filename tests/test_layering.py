@@ -35,7 +35,6 @@ ONLY_INSIDE_FUNCTIONS = {
     "plotly",
     "ray",
     "rerun",
-    "rliable",
     "sb3_contrib",
     "sklearn",
     "stable_baselines3",

@@ -85,5 +85,5 @@ def test_no_bar_goes_around() -> None:
         if "import tqdm" in path.read_text()
     ]
     # The two do not draw one: a lock for workers, and stages of a mesh in a terminal only.
-    allowed = ["progress.py", "parallel.py", "scenes/mesh_file.py"]
+    allowed = ["_runtime/progress.py", "_runtime/parallel.py", "scenes/mesh_file.py"]
     assert sorted(found) == sorted(f"ms_slam_env/{name}" for name in allowed)

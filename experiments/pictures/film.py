@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 
 from ms_slam_env import ENV_IDS, PERTURBED_ENV_IDS
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.output_files import write_bytes
 from ms_slam_env._runtime.progress import Bar
 from ms_slam_env.config import Checked, bounded, chosen, free_options
@@ -39,9 +40,6 @@ from ms_slam_env.env.third_person_view import (
 from ms_slam_env.errors import InputError
 from ms_slam_env.planning.occupancy_grid import OccupancyGrid
 from ms_slam_env.scenes.base import Scene, floor_height
-
-Float64 = NDArray[np.float64]
-
 
 _SIZE = (560, 480)  # width and height of the map
 _MARGIN_M = 0.2

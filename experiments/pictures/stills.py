@@ -24,6 +24,7 @@ from ms_slam_experiments.arm_masks import floor_below, start_arm
 from numpy.typing import NDArray
 
 from ms_slam_env import scenes
+from ms_slam_env._runtime.arrays import Float64, Image
 from ms_slam_env._runtime.command_line import exit_code, parse
 from ms_slam_env._runtime.output_files import check_out_file, check_out_folder, write_bytes
 from ms_slam_env._runtime.timings import Timings
@@ -38,10 +39,6 @@ from ms_slam_env.scenes import Scene, TexturedMesh
 from ms_slam_env.scenes.homes.home import HomeScene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences.usme_suite import SUITE, render
-
-Float64 = NDArray[np.float64]
-Image = NDArray[np.uint8]
-
 
 BORDER, TITLE = 4, 18  # pixels
 

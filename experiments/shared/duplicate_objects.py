@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from ms_slam_env._runtime.arrays import Bool, Float64, Int64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
@@ -21,11 +22,6 @@ from ms_slam_env.geometry.point_clouds import check_points, voxel_firsts
 from ms_slam_env.scenes.mesh_queries import sample_surface
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene
-
-Float64 = NDArray[np.float64]
-
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,13 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, rendered_size
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.recording import Recording, open_recording
 from ms_slam_env.sequences.recording.recording import RecordedSequence
 from ms_slam_env.sequences.trajectory import read_trajectory
-
-Float64 = NDArray[np.float64]
 
 INTRINSICS = Intrinsics(fx=481.2, fy=480.0, cx=319.5, cy=239.5, width=640, height=480)
 RECORDED = "lr_kt3"

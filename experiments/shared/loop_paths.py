@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import Float64, look_at
+from ms_slam_env.geometry import look_at
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sequences.paths import HandheldPath
 from ms_slam_env.sequences.paths.base import frame_times

@@ -68,9 +68,11 @@ class ExtensionPoint:
             own = self.own[name]
             return self._load(name, own, "") if isinstance(own, str) and ":" in own else own
         if ":" in name:
-            # A console script, unlike ``python -m``, leaves the current folder out.
+            # A console script, unlike ``python -m``, leaves the current folder out. It stays, since
+            # worker processes, which get this path, import the module too; and it comes last, so
+            # that no ``random.py`` there stands in for a library's that is imported later.
             if os.getcwd() not in sys.path:
-                sys.path.insert(0, os.getcwd())
+                sys.path.append(os.getcwd())
             return self._checked(self._load(name, name, ""), name)
         found = [entry for entry in entry_points(group=self.group) if entry.name == name]
         if not found:

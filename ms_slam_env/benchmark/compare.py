@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.parallel import limit_threads, thread_environment
 from ms_slam_env.benchmark.command_runs import (
     check_command,
@@ -39,8 +40,6 @@ from ms_slam_env.scenes import PUBLISHED_ROOMS
 from ms_slam_env.sequences import HandheldPath, associate, read_trajectory
 from ms_slam_env.sequences import Sequence as RGBDSequence
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S
-
-Float64 = NDArray[np.float64]
 
 DEFAULT_SEQUENCES = (
     "living_room:2000:none",

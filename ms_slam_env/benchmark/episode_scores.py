@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ms_slam_env import metrics
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.evaluation.map_quality import SURFACE_SPACING_M, ScoreCurve, map_quality
 from ms_slam_env.evaluation.map_truth import reference_surface, true_surface
 from ms_slam_env.slam.slam_backend import SlamBackend
-
-Float64 = NDArray[np.float64]
 
 LOST_ERROR_M = 0.3
 """An estimate this far off is lost even where SLAM does not say so."""

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 import ms_slam_env
 from ms_slam_env import slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import Checked, bounded, chosen, nested_options
 from ms_slam_env.env import Planner
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
@@ -32,8 +32,6 @@ from dataclasses import fields
 
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.report.records import Row
-
-Float64 = NDArray[np.float64]
 
 DEFAULT_PLANNERS = ("random", "stationary", "greedy", "max-information")
 DEFAULT_SCENES = ("living_room", "corridor", "table", "wall")

@@ -1,4 +1,4 @@
-"""Tables that compare planners: losses together, and what rliable says across scenes."""
+"""Tables that compare planners: losses together, and aggregates across scenes."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def with_losses(table: Table, rows: Sequence[Row]) -> Table:
 def score_matrices(rows: Sequence[Row], metric: str = RANKED_BY) -> dict[str, NDArray[np.float64]]:
     """Scores (episodes, scenes) of each planner that finished an episode in every scene.
 
-    Scenes with more finished episodes than another lose the surplus, as rliable needs a matrix.
+    Scenes with more finished episodes than another lose the surplus.
     """
     scenes = list(dict.fromkeys(row["spec"]["scene"] for row in rows))
     matrices = {}
@@ -78,9 +78,9 @@ def score_matrices(rows: Sequence[Row], metric: str = RANKED_BY) -> dict[str, ND
 
 
 def across_scenes(rows: Sequence[Row], title: str = "") -> list[Table]:
-    """rliable's interquartile means, best first; nothing without rliable."""
+    """Interquartile means, best first."""
     scores = score_matrices(rows)
-    if not statistics.has_rliable() or not scores:
+    if not scores:
         return []
     means = statistics.interquartile_means(scores)
     lines: list[dict[str, Any]] = [
@@ -101,13 +101,13 @@ COMPARED = {
 def better_than_each_other(
     rows: Sequence[Row], prefix: str = "", metric: str = RANKED_BY
 ) -> list[Table]:
-    """rliable's probability that a line's planner has a better score than a column's.
+    """Probability that a line's planner has a better score than a column's.
 
-    Nothing without rliable, or of a single planner.
+    Nothing of a single planner.
     """
     title, what = COMPARED[metric]
     scores = score_matrices(rows, metric)
-    if not statistics.has_rliable() or len(scores) < 2:
+    if len(scores) < 2:
         return []
     ranked = _best_first(scores)
     note = f"Probability that a line's planner has the {what}, with 95 % intervals."

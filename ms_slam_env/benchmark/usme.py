@@ -12,6 +12,7 @@ import tyro
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics, scenes, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.parallel import limit_threads, thread_environment
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame, rendered_size, xtion
@@ -31,7 +32,6 @@ from ms_slam_env.sequences.usme_suite import NAMES, SUITE, UsmeSequence, find, m
 if TYPE_CHECKING:
     from ms_slam_env.sequences import RenderedSequence
 
-Float64 = NDArray[np.float64]
 
 TABLES: Mapping[str, tuple[str, ...]] = {
     "Accuracy": (

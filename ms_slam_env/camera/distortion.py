@@ -17,12 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError, unknown
-
-Array = NDArray[np.float64]
 
 _LARGEST = 20.0  # of any coefficient, more than calibrations have
 _LARGEST_RATIONAL = 1000.0  # those above and below the line cancel out
@@ -113,7 +112,7 @@ class Distortion(Checked):
         """Whether there is any."""
         return self.model != "none"
 
-    def distort(self, points: ArrayLike) -> Array:
+    def distort(self, points: ArrayLike) -> Float64:
         """Where rays (..., 2) with z = 1 appear, before focal length and centre (..., 2)."""
         p = np.asarray(points, dtype=np.float64)
         if self.model == "none":
@@ -127,7 +126,7 @@ class Distortion(Checked):
         down = self.p1 * (squared + 2 * y**2) + 2 * self.p2 * x * y
         return p * radial[..., None] + np.stack([across, down], axis=-1)
 
-    def undistort(self, points: ArrayLike) -> Array:
+    def undistort(self, points: ArrayLike) -> Float64:
         """The inverse of ``distort``, by Newton's method.
 
         Raises:
@@ -158,7 +157,7 @@ class Distortion(Checked):
         xx, xy, yy = self._jacobian(np.asarray(points, dtype=np.float64))
         return bool(((xx * yy - xy**2 > 0) & (xx + yy > 0)).all())
 
-    def _bent_angle(self, r: Array) -> tuple[Array, Array]:
+    def _bent_angle(self, r: Float64) -> tuple[Float64, Float64]:
         """theta_d / r (...,) of the equidistant model at r (...,), and d theta_d / d r."""
         theta = np.arctan(r)
         t = theta**2
@@ -167,7 +166,7 @@ class Distortion(Checked):
         ratio = np.where(r > 1e-9, theta * grown / np.maximum(r, 1e-9), 1.0)
         return ratio, slope / (1 + r**2)
 
-    def _radial(self, s: Array) -> tuple[Array, Array]:
+    def _radial(self, s: Float64) -> tuple[Float64, Float64]:
         """The radial factor (...,) at s = r^2 (...,), and its derivative d / d s."""
         above = 1 + s * (self.k1 + s * (self.k2 + s * self.k3))
         slope = self.k1 + s * (2 * self.k2 + s * 3 * self.k3)
@@ -179,7 +178,7 @@ class Distortion(Checked):
             ratio = above / below
             return ratio, (slope - ratio * falling) / below
 
-    def _jacobian(self, p: Array) -> tuple[Array, Array, Array]:
+    def _jacobian(self, p: Float64) -> tuple[Float64, Float64, Float64]:
         """d distort / d(x, y), a symmetric matrix: its entries xx, xy and yy (...,)."""
         x, y = p[..., 0], p[..., 1]
         squared = x**2 + y**2

@@ -9,10 +9,9 @@ from numbers import Integral, Real
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera.distortion import NO_DISTORTION, Distortion
 from ms_slam_env.errors import InputError
-
-Array = NDArray[np.float64]
 
 XTION_SIZES: dict[str, tuple[int, int]] = {
     "80x60": (80, 60),
@@ -181,12 +180,12 @@ class Intrinsics:
             )
         return replace(self, cx=self.cx - left, cy=self.cy - top, width=width, height=height)
 
-    def rays(self) -> Array:
+    def rays(self) -> Float64:
         """Viewing rays (height, width, 3) in the camera frame with z = 1."""
         v, u = np.mgrid[: self.height, : self.width].astype(np.float64)
         return self.rays_at(np.stack([u, v], axis=-1))
 
-    def rays_at(self, pixels: ArrayLike) -> Array:
+    def rays_at(self, pixels: ArrayLike) -> Float64:
         """Viewing rays (..., 3) with z = 1 through pixels (..., 2), the inverse of ``project``.
 
         Raises:
@@ -199,11 +198,11 @@ class Intrinsics:
         return np.stack([x, y, np.ones_like(u)], -1)
 
     @property
-    def matrix(self) -> Array:
+    def matrix(self) -> Float64:
         """Camera matrix (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    def project(self, points: ArrayLike) -> Array:
+    def project(self, points: ArrayLike) -> Float64:
         """Pixel coordinates (..., 2) of points (..., 3) of the camera frame with z > 0."""
         p = np.asarray(points, dtype=np.float64)
         if self.distortion:

@@ -11,15 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Int32
 from ms_slam_env._runtime.warp import HostDeviceBuffer, RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.divergence import kernels
 from ms_slam_env.divergence.config import DivergenceConfig
 from ms_slam_env.divergence.sphere import MAP_SIZE, bin_directions, bins_near
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64
-
-Int32 = NDArray[np.int32]
 
 _LARGEST_COPY = 1 << 18
 """Bytes up to which copying images costs less than telling Warp of them, 20 microseconds each."""

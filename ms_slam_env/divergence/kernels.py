@@ -10,17 +10,17 @@ indexing, with any strides, takes longer than what they compute. So images must 
 
 from __future__ import annotations
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
 
 
 @wp.func_native(native_source("histograms", "invert_row"))
-def invert_row(depth: wp.array(dtype=wp.float32), width: int, inverse: wp.array(dtype=wp.float32)):
+def invert_row(depth: wp.array[wp.float32], width: int, inverse: wp.array[wp.float32]) -> None:
     """Inverse depth of a row of pixels."""
 
 
 @wp.kernel
-def invert_depth(depth: wp.array3d(dtype=wp.float32), inverse: wp.array3d(dtype=wp.float32)):
+def invert_depth(depth: wp.array3d[wp.float32], inverse: wp.array3d[wp.float32]) -> None:
     """Inverse depth in 1/m; where there is no reading, a number too large to be one."""
     b, v = wp.tid()
     invert_row(depth[b, v], depth.shape[2], inverse[b, v])
@@ -37,7 +37,7 @@ def plane_normal(
     focal: wp.vec2,
     offset: wp.vec2,
     per_pixel: float,
-):
+) -> wp.vec3:
     """Normal towards the camera, of any length; zero if there is none.
 
     On the plane n . p = d the inverse depth is n . ray / d, linear in the pixel coordinates, so
@@ -64,7 +64,7 @@ def plane_normal(
 
 @wp.func
 def normal_at(
-    inverse: wp.array3d(dtype=wp.float32),
+    inverse: wp.array3d[wp.float32],
     b: int,
     v: int,
     u: int,
@@ -72,7 +72,7 @@ def normal_at(
     edge_threshold: float,
     focal: wp.vec2,
     centre: wp.vec2,
-):
+) -> wp.vec3:
     """Normal of pixel (v, u) of image ``b`` by its four neighbours ``radius`` pixels away."""
     return plane_normal(
         inverse[b, v, u],
@@ -88,7 +88,7 @@ def normal_at(
 
 
 @wp.func
-def direction_cell(n: wp.vec3, size: int):
+def direction_cell(n: wp.vec3, size: int) -> int:
     """Cell of direction ``n`` (any length but 0) in an octahedral map with -z at its centre."""
     half = 0.5 * float(size)
     scale = half / (wp.abs(n[0]) + wp.abs(n[1]) + wp.abs(n[2]))
@@ -106,26 +106,26 @@ def direction_cell(n: wp.vec3, size: int):
 def add_to_bins(
     n: wp.vec3,
     inverse: float,
-    directions: wp.array(dtype=wp.vec3),
-    near: wp.array2d(dtype=wp.int32),
+    directions: wp.array[wp.vec3],
+    near: wp.array2d[wp.int32],
     cell: int,
     cos_alpha: float,
     first: int,
-    sums: wp.array(dtype=wp.float32),
-):
+    sums: wp.array[wp.float32],
+) -> None:
     """Add the weights of direction ``n``, of length 1 / ``inverse``, to the bins near its cell."""
 
 
 @wp.func
 def add_weights(
     n: wp.vec3,
-    directions: wp.array(dtype=wp.vec3),
-    near: wp.array2d(dtype=wp.int32),
+    directions: wp.array[wp.vec3],
+    near: wp.array2d[wp.int32],
     size: int,
     cos_alpha: float,
     first: int,
-    sums: wp.array(dtype=wp.float32),
-):
+    sums: wp.array[wp.float32],
+) -> None:
     """Add the weights (8) of direction ``n``, times 1 - cos(alpha), to the bins from ``first``."""
     cell, inverse = direction_cell(n, size), 1.0 / wp.length(n)
     add_to_bins(n, inverse, directions, near, cell, cos_alpha, first, sums)
@@ -133,26 +133,26 @@ def add_weights(
 
 @wp.func_native(native_source("histograms", "count_row"))
 def count_row(
-    intensity: wp.array(dtype=wp.float32),
-    depth: wp.array(dtype=wp.float32),
+    intensity: wp.array[wp.float32],
+    depth: wp.array[wp.float32],
     only_with_depth: int,
-    column_window: wp.array(dtype=wp.int32),
+    column_window: wp.array[wp.int32],
     width: int,
     first: int,
-    counts: wp.array(dtype=wp.int32),
-):
+    counts: wp.array[wp.int32],
+) -> None:
     """Count the grey levels of a row of pixels."""
 
 
 @wp.kernel
 def count_intensity(
-    intensity: wp.array3d(dtype=wp.float32),
-    depth: wp.array3d(dtype=wp.float32),
+    intensity: wp.array3d[wp.float32],
+    depth: wp.array3d[wp.float32],
     only_with_depth: int,
-    row_window: wp.array(dtype=wp.int32),
-    column_window: wp.array(dtype=wp.int32),
-    counts: wp.array2d(dtype=wp.int32),
-):
+    row_window: wp.array[wp.int32],
+    column_window: wp.array[wp.int32],
+    counts: wp.array2d[wp.int32],
+) -> None:
     """Add a row of pixels to the grey levels (B, windows * 256) of its frame."""
     b, v = wp.tid()
     first = 256 * row_window[v]
@@ -169,20 +169,20 @@ def count_intensity(
 
 @wp.kernel
 def weigh_depth_normals(
-    inverse: wp.array3d(dtype=wp.float32),
+    inverse: wp.array3d[wp.float32],
     focal: wp.vec2,
     centre: wp.vec2,
     radius: int,
     edge_threshold: float,
-    row_window: wp.array(dtype=wp.int32),
-    column_window: wp.array(dtype=wp.int32),
-    directions: wp.array(dtype=wp.vec3),
-    near: wp.array2d(dtype=wp.int32),
+    row_window: wp.array[wp.int32],
+    column_window: wp.array[wp.int32],
+    directions: wp.array[wp.vec3],
+    near: wp.array2d[wp.int32],
     size: int,
     cos_alpha: float,
     per_row: int,
-    sums: wp.array(dtype=wp.float32),
-):
+    sums: wp.array[wp.float32],
+) -> None:
     """Sum the weights of the normals of a row of pixels, (B, H, windows * bins), equation (9)."""
     b, v = wp.tid()
     height = inverse.shape[1]
@@ -201,16 +201,16 @@ def weigh_depth_normals(
 
 @wp.kernel
 def weigh_given_normals(
-    normals: wp.array3d(dtype=wp.vec3),
-    row_window: wp.array(dtype=wp.int32),
-    column_window: wp.array(dtype=wp.int32),
-    directions: wp.array(dtype=wp.vec3),
-    near: wp.array2d(dtype=wp.int32),
+    normals: wp.array3d[wp.vec3],
+    row_window: wp.array[wp.int32],
+    column_window: wp.array[wp.int32],
+    directions: wp.array[wp.vec3],
+    near: wp.array2d[wp.int32],
     size: int,
     cos_alpha: float,
     per_row: int,
-    sums: wp.array(dtype=wp.float32),
-):
+    sums: wp.array[wp.float32],
+) -> None:
     """Sum the weights of given normals of a row of pixels, (B, H, windows * bins), (9)."""
     b, v = wp.tid()
     width = normals.shape[2]
@@ -226,13 +226,13 @@ def weigh_given_normals(
 
 @wp.kernel
 def compute_normals(
-    inverse: wp.array3d(dtype=wp.float32),
+    inverse: wp.array3d[wp.float32],
     focal: wp.vec2,
     centre: wp.vec2,
     radius: int,
     edge_threshold: float,
-    normals: wp.array3d(dtype=wp.vec3),
-):
+    normals: wp.array3d[wp.vec3],
+) -> None:
     """Unit normals of a row of pixels, zero where there is none."""
     b, v = wp.tid()
     height = inverse.shape[1]

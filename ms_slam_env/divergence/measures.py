@@ -9,9 +9,9 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import coo_array
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.divergence.counting import HistogramCounter, Histograms
 from ms_slam_env.divergence.sphere import bin_directions
-from ms_slam_env.geometry import Float64
 
 
 class Divergence(HistogramCounter, ABC):

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env.geometry import Float64
+from ms_slam_env._runtime.arrays import Float64
 
 MAP_SIZE = 32
 """Cells along one side of the octahedral map of directions; even, so that no fold cuts a cell."""

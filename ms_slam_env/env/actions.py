@@ -9,11 +9,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Bool
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.adaptation import AdaptationConfig, AdaptiveSlam, AgentConfig
 from ms_slam_env.slam.slam_backend import SlamBackend
-
-Bool = NDArray[np.bool_]
 
 
 class MaskedDiscrete(spaces.Discrete):

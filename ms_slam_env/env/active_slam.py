@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import slam as slam_backends
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.env.actions import ActionDecoder, MotionActions, MotionAndConfigurationActions
 from ms_slam_env.env.camera_feed import CameraFeed, make_camera_feed
@@ -33,8 +34,6 @@ from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences.perturbations.base import Perturbation
 from ms_slam_env.slam.slam_backend import SlamBackend, Views
-
-Float64 = NDArray[np.float64]
 
 
 class ActiveSlamEnv(gymnasium.Env[Any, Any]):

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Distortion, RGBDFrame, xtion
 from ms_slam_env.camera.distortion import NO_DISTORTION
 from ms_slam_env.errors import InputError
@@ -19,8 +20,6 @@ from ms_slam_env.sequences.perturbations.movers import Mover
 from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 from ms_slam_env.slam.shared.state_check import MOST, SEED, ListOf, Real
-
-Float64 = NDArray[np.float64]
 
 _EPISODE_FRAMES = 151  # one a step and the first: what runs over a whole sequence ends here
 _NEAREST_M = 0.35  # nearer than this to the camera nothing comes by itself

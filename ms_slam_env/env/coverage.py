@@ -12,11 +12,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import RecordedLaunch, wp
+from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env._runtime.warp import RecordedLaunch
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
 from ms_slam_env.scenes.base import Scene
-
-Float64 = NDArray[np.float64]
 
 _STRIDE = 2  # every second pixel in each direction marks coverage
 
@@ -82,27 +82,27 @@ class VoxelGrid:
 
 @wp.func_native(native_source("coverage", "mark_points"))
 def mark_points(
-    depth: wp.array(dtype=wp.float32),
-    rays: wp.array(dtype=wp.float64),
-    poses: wp.array(dtype=wp.mat44d),
+    depth: wp.array[wp.float32],
+    rays: wp.array[wp.float64],
+    poses: wp.array[wp.mat44d],
     grid: VoxelGrid,
-    reachable: wp.array(dtype=wp.uint8),
-    mapped: wp.array(dtype=wp.uint8),
-    counts: wp.array(dtype=wp.int32),
-):
+    reachable: wp.array[wp.uint8],
+    mapped: wp.array[wp.uint8],
+    counts: wp.array[wp.int32],
+) -> None:
     """Mark what ``mark_seen`` says."""
 
 
 @wp.kernel
 def mark_seen(
-    depth: wp.array(dtype=wp.float32),  # (N,) metres; 0 = nothing
-    rays: wp.array(dtype=wp.float64),  # (3 N,) points at depth 1 m
-    poses: wp.array(dtype=wp.mat44d),  # (2,) true and estimated T_world_camera
+    depth: wp.array[wp.float32],  # (N,) metres; 0 = nothing
+    rays: wp.array[wp.float64],  # (3 N,) points at depth 1 m
+    poses: wp.array[wp.mat44d],  # (2,) true and estimated T_world_camera
     grid: VoxelGrid,
-    reachable: wp.array(dtype=wp.uint8),  # (voxels,)
-    mapped: wp.array(dtype=wp.uint8),  # (voxels,) in and out
-    counts: wp.array(dtype=wp.int32),  # (2,) voxels mapped, and of those reachable; in and out
-):
+    reachable: wp.array[wp.uint8],  # (voxels,)
+    mapped: wp.array[wp.uint8],  # (voxels,) in and out
+    counts: wp.array[wp.int32],  # (2,) voxels mapped, and of those reachable; in and out
+) -> None:
     """Mark the true voxels of points that the estimate puts less than a voxel away; one thread."""
     mark_points(depth, rays, poses, grid, reachable, mapped, counts)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.divergence import Histograms
 from ms_slam_env.env.pose_sources import FrameObservation
@@ -16,8 +17,6 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
 from ms_slam_env.planning import OccupancyGrid
 from ms_slam_env.slam.slam_backend import TrackResult
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

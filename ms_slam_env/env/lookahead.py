@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
 from ms_slam_env.env.config import LookaheadConfig
 from ms_slam_env.slam.slam_backend import SlamBackend, Views
-
-Float64 = NDArray[np.float64]
 
 
 class Lookahead:

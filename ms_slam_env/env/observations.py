@@ -7,8 +7,9 @@ from typing import Any
 import cv2
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.camera import Intrinsics, intensity_image
 from ms_slam_env.env.registry import POINT, Observation
 from ms_slam_env.env.robot_knowledge import (
@@ -38,9 +39,6 @@ from ms_slam_env.planning.candidates import (
 )
 from ms_slam_env.planning.goals_around import NUM_GOALS, gain_around
 from ms_slam_env.planning.view_goals import GOAL_RADIUS_M, best_goal, distance_in_steps
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 CONFIGURATION = "slam_configuration"
 """Key of the SLAM configuration in ``info``, and in an observation of several parts."""

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Image
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
-
-Image = NDArray[np.uint8]
-Float64 = NDArray[np.float64]
 
 NEAREST_M = 0.1  # what is nearer to the point of view is not drawn
 BACKGROUND = 250

@@ -5,13 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Image
 from ms_slam_env.env.config import TargetConfig
 from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.point_renderer import BACKGROUND
@@ -15,9 +15,6 @@ from ms_slam_env.env.third_person_view import ESTIMATE_COLOR, draw_third_person
 from ms_slam_env.robot import Embodiment, describe
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.slam.slam_backend import SlamBackend
-
-Image = NDArray[np.uint8]
-Float64 = NDArray[np.float64]
 
 PANEL = (240, 320)
 """Height and width of the live images."""

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env._runtime.output_files import write_bytes
 from ms_slam_env.env.planners import Planner, goal_of
@@ -19,7 +18,6 @@ from ms_slam_env.robot import describe
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
 
-Float64 = NDArray[np.float64]
 
 APPLICATION = "ms_slam_env"
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")

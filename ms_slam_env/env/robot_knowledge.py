@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.planning import OccupancyGrid
 from ms_slam_env.planning.candidates import PredictedViews
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
 from ms_slam_env.slam.slam_backend import Views
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 STATE_NAMES: tuple[str, ...] = (
     *("x", "y", "z"),

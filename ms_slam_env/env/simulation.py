@@ -7,8 +7,8 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import Histograms, make_divergence
@@ -27,8 +27,6 @@ from ms_slam_env.scenes.registry import SCENES, SceneName, name_of
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
-
-Float64 = NDArray[np.float64]
 
 _START_TRIES = 10  # a drawn start sees surface in most of its view: one try is nearly always enough
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Image
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.point_renderer import project, render_points
@@ -15,9 +16,6 @@ from ms_slam_env.robot.arm.arm import ArmEmbodiment
 from ms_slam_env.robot.arm.shape import arm_parts, column_parts, surface_dots
 from ms_slam_env.scenes.base import Scene, floor_height
 from ms_slam_env.slam.slam_backend import SlamBackend
-
-Image = NDArray[np.uint8]
-Float64 = NDArray[np.float64]
 
 TRUE_COLOR = (110, 215, 110)
 ESTIMATE_COLOR = (205, 0, 40)

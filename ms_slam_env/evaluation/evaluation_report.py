@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.evaluation.map_files import MEASURES, MapOptions, evaluate_maps
 from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
 from ms_slam_env.evaluation.rerun_file import write_paths
@@ -29,7 +30,6 @@ from ms_slam_env.report.table_files import write_tables
 from ms_slam_env.report.tables import Column, Table, format_value, make_table
 from ms_slam_env.sequences import write_trajectory
 
-Float64 = NDArray[np.float64]
 Found = Mapping[str, Any]
 
 EVALUATION = "evaluation.json"

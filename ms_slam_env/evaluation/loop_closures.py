@@ -11,13 +11,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Bool, Float64, Int32
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.evaluation.seen_surface import back_projected
-from ms_slam_env.geometry import Float64, invert, relative_angle
+from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.slam_backend import Loop
-
-Int32 = NDArray[np.int32]
-Bool = NDArray[np.bool_]
 
 WRONG_DEG = 3.0  # a loop is wrong if it is off by more
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env import metrics
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.evaluation_report import Evaluation
 from ms_slam_env.evaluation.rerun_file import write_paths
@@ -23,8 +23,6 @@ from ms_slam_env.report import figures
 from ms_slam_env.report.charts import Chart
 from ms_slam_env.report.statistics import median_interval
 from ms_slam_env.report.tables import Column, Table, Value, make_table
-
-Float64 = NDArray[np.float64]
 
 BOXES, PATHS = "errors.png", "runs.rrd"
 _QUARTILES = {"percentile_5": 5, "quartile_25": 25, "median": 50, "quartile_75": 75,

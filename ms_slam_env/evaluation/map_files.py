@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env import metrics
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
@@ -26,8 +26,6 @@ from ms_slam_env.geometry.cloud_registration import CUTOFF_M, REGISTRATIONS
 from ms_slam_env.metrics.reconstruction import SAMPLES
 from ms_slam_env.scenes.mesh_formats import MESH_SUFFIXES, MeshFile
 from ms_slam_env.sequences.recording import Recording, open_recording, recorded_sequence
-
-Float64 = NDArray[np.float64]
 
 MEASURES = (
     *("accuracy_cm", "completion_cm", "completion_ratio", "rer_m", "rcm"),

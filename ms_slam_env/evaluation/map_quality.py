@@ -16,8 +16,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry.point_clouds import IndexedCloud, indexed, voxel_downsample
 from ms_slam_env.metrics.reconstruction import (
@@ -26,8 +27,6 @@ from ms_slam_env.metrics.reconstruction import (
     nearest_distances,
     rer,
 )
-
-Float64 = NDArray[np.float64]
 
 THRESHOLDS_M = (0.02, 0.05)
 MAP_VOXEL_M = 0.01  # a surface counts by its area, not by how often it was seen

@@ -14,9 +14,9 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from ms_slam_env._runtime.arrays import Bool, Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, transform_points
@@ -26,9 +26,6 @@ from ms_slam_env.robot.arm.arm import ArmEmbodiment, camera_poses
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.sensor.scene_cache import get_scene
-
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 RADIUS_M = 3.0  # what a view reaches, in every direction; part of the protocol
 REACH_M = 1.0

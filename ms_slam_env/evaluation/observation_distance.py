@@ -20,10 +20,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.geometry import invert, transform_points
-
-Float64 = NDArray[np.float64]
 
 _ACROSS = 40  # landmarks in a row of the grid
 _HIDDEN = 0.05  # of the depth by which a landmark may lie behind what the later frame sees

@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.output_files import write_bytes, write_text
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import SequenceRun
 from ms_slam_env.evaluation.tracking_diagnosis import alignment_columns
 from ms_slam_env.slam.slam_backend import SlamBackend
 from ms_slam_env.slam.volumetric.voxel_grid import load_open3d
-
-Float64 = NDArray[np.float64]
 
 COSTS = ("frame_cpu_ms", "frame_ext_ms", "frame_mem_mb", "frame_ene_j")
 """Metrics of one frame, as `frame_costs` gives them."""

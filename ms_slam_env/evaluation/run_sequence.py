@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env import slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.progress import Bar
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.config import parse_named
@@ -39,8 +40,6 @@ from ms_slam_env.metrics.cost import CostMeter
 from ms_slam_env.metrics.cost.meter import FrameCost
 from ms_slam_env.sequences.sequence import Sequence
 from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
-
-Float64 = NDArray[np.float64]
 
 Track = Callable[[RGBDFrame], TrackResult]
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.interrupts import recorded
 from ms_slam_env._runtime.output_files import growing_file, write_bytes
 from ms_slam_env._runtime.result_folders import alone_in, result_folder
@@ -53,8 +53,6 @@ from ms_slam_env.sequences.trajectory import (
     write_trajectory,
 )
 from ms_slam_env.slam.frame_selection import EveryFrameConfig, FrameSelectionConfig
-
-Float64 = NDArray[np.float64]
 
 TRAJECTORY, UNFINISHED = "trajectory.txt", "trajectory.incomplete.txt"
 CORRECTED, TRUTH = "trajectory.corrected.txt", "groundtruth.txt"

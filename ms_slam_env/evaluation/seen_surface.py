@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.sequences import CameraPath, Sequence
-
-Float64 = NDArray[np.float64]
 
 SURFACE_SPACING_M = 0.01
 CUTOFF_M = 5.0

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.progress import Bar
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import MEASURES, DivergenceConfig, make_divergence
@@ -26,8 +27,6 @@ from ms_slam_env.report.results import Results, write_result_folder
 from ms_slam_env.report.tables import Table, Value, make_table
 from ms_slam_env.sequences import Sequence as RGBDSequence
 from ms_slam_env.sequences.recording import Recording
-
-Float64 = NDArray[np.float64]
 
 KINDS = ("intensity", "depth")
 WASSERSTEIN = "wasserstein"

@@ -7,14 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env import metrics
+from ms_slam_env._runtime.arrays import Float64, Int32
 from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env.evaluation.run_sequence import SequenceRun
-
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
 
 _FEWEST = 3  # poses that an alignment takes
 

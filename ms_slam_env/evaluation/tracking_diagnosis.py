@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.evaluation.run_sequence import SequenceRun, Step
 from ms_slam_env.evaluation.trajectory_charts import marked_panel
@@ -16,8 +17,6 @@ from ms_slam_env.report import figures
 from ms_slam_env.report.charts import Chart
 from ms_slam_env.report.tables import Table, make_table
 from ms_slam_env.slam.slam_backend import TrackResult, Views
-
-Float64 = NDArray[np.float64]
 
 REFUSED = "refused.png"
 ALIGNMENT = ("inlier_fraction", "overlap", "residual_m", "degenerate_directions")

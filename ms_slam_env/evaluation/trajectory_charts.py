@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.report.charts import Panel, Series
-
-Float64 = NDArray[np.float64]
 
 MOST_POINTS = 1000
 """Of a line: more are not told apart on a screen."""

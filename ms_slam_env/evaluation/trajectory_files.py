@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import metrics
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.input_files import read_text
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError, InputWarning
@@ -23,8 +24,6 @@ from ms_slam_env.metrics.relative import (
 )
 from ms_slam_env.metrics.trajectory import ALIGNMENTS, check_first
 from ms_slam_env.sequences import associate, read_trajectory
-
-Float64 = NDArray[np.float64]
 
 _GAP_INTERVALS = 3.0
 _LEAST_SHARE = 0.5  # of the poses of the shorter trajectory

@@ -9,17 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ms_slam_env import metrics
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.trajectory_files import Matched, TrajectoryOptions, match_files
 from ms_slam_env.metrics.relative import (
     printed_ate,
     printed_relative_errors,
 )
-
-Float64 = NDArray[np.float64]
 
 _ALIGNED = {
     **{"se3": "ate", "sim3": "ate_sim3", "yaw": "ate_yaw"},

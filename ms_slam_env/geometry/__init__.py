@@ -1,5 +1,6 @@
 """Rigid motions: SO(3) and SE(3) maps, quaternions, pose checks."""
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.geometry.pose import (
     MAX_COORDINATE_M,
     as_numbers,
@@ -13,7 +14,7 @@ from ms_slam_env.geometry.pose import (
     relative_angle,
     transform_points,
 )
-from ms_slam_env.geometry.so3 import Float64, adjoint, hat, se3_exp, se3_log, so3_exp, so3_log
+from ms_slam_env.geometry.so3 import adjoint, hat, se3_exp, se3_log, so3_exp, so3_log
 
 __all__ = [
     "MAX_COORDINATE_M",

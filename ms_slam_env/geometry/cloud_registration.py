@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import se3_exp, transform_points
 from ms_slam_env.geometry.point_clouds import IndexedCloud, check_points, indexed
-
-Float64 = NDArray[np.float64]
 
 REGISTRATIONS = ("none", "icp", "plane-icp", "gicp")
 CUTOFF_M = 0.5

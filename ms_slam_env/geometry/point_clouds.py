@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry.pose import as_numbers
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
-
-Float64 = NDArray[np.float64]
 
 
 def check_points(points: ArrayLike, name: str) -> Float64:

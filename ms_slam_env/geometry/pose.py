@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry.so3 import Float64
 
 MAX_COORDINATE_M = 1e9
 """Places farther from the origin than this are mistakes, whose squares lose all precision."""

@@ -7,9 +7,9 @@ equations (132) to (146) and (172) to (174). A twist is (rho, phi): translation 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float64 = NDArray[np.float64]
+from ms_slam_env._runtime.arrays import Float64
 
 _SMALL_ANGLE = 1e-5  # below this the closed forms lose digits to cancellation; use their series
 

@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, as_numbers
+from ms_slam_env.geometry import as_numbers
 from ms_slam_env.metrics.relative import motion_errors, relative_errors
 from ms_slam_env.metrics.trajectory import (
     ErrorStatistics,

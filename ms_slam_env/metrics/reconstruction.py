@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, transform_points
+from ms_slam_env.geometry import transform_points
 from ms_slam_env.geometry.cloud_registration import CUTOFF_M, register_clouds
 from ms_slam_env.geometry.point_clouds import IndexedCloud, check_points, indexed
 from ms_slam_env.metrics.trajectory import check_count, check_positive

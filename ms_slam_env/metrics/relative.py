@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import Float64, invert
+from ms_slam_env.geometry import invert
 from ms_slam_env.metrics.trajectory import (
     ErrorStatistics,
     check_count,
@@ -29,8 +30,6 @@ from ms_slam_env.metrics.trajectory import (
     statistics_of,
     with_arguments_of,
 )
-
-Int64 = NDArray[np.int64]
 
 DELTA_UNITS = ("frames", "m", "s")
 PAIRINGS = ("all", "consecutive")

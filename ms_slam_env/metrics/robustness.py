@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import logm
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import Float64, as_numbers
+from ms_slam_env.geometry import as_numbers
 from ms_slam_env.geometry.point_clouds import umeyama, umeyama_scales
 from ms_slam_env.metrics.trajectory import check_pair, check_positions, check_positive
 

@@ -18,8 +18,9 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import Float64, as_numbers, invert, so3_exp
+from ms_slam_env.geometry import as_numbers, invert, so3_exp
 from ms_slam_env.geometry.point_clouds import umeyama
 
 P = ParamSpec("P")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, so3_log
 from ms_slam_env.planning.expected_gain import expected_gain, look_from
@@ -21,8 +22,6 @@ from ms_slam_env.planning.trackability import (
 )
 from ms_slam_env.planning.view_goals import distance_in_steps
 from ms_slam_env.slam.slam_backend import Views
-
-Float64 = NDArray[np.float64]
 
 NAMES: tuple[str, ...] = (
     *("permitted", "intensity_divergence", "depth_divergence", "criterion", "overlap", "near"),

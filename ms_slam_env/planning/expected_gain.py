@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.planning.kernels import BLOCK, sum_unknown, sum_unknown_held
 from ms_slam_env.planning.occupancy_grid import OccupancyGrid
-
-Float64 = NDArray[np.float64]
 
 RAYS = (16, 12)  # of a view, across and down
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.planning.expected_gain import expected_gain
 from ms_slam_env.planning.occupancy_grid import OccupancyGrid
 from ms_slam_env.planning.view_goals import upright_poses
-
-Float64 = NDArray[np.float64]
 
 _HEADINGS = 8
 _RINGS_M = (0.5, 1.0, 2.0)

@@ -1,6 +1,6 @@
 """Warp kernels of the occupancy grid and of what predicted views tell."""
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 
 PASSED = wp.constant(1)  # a cell that a ray crossed which ends on a surface
 STRUCK = wp.constant(2)  # a cell in which a ray ended
@@ -20,7 +20,7 @@ vec6 = wp.types.vector(length=6, dtype=wp.float32)
 
 
 @wp.func
-def _cell(at: wp.vec3, shape: wp.vec3i):
+def _cell(at: wp.vec3, shape: wp.vec3i) -> wp.vec3i:
     """The cell of a point, in cells; (-1, -1, -1) outside."""
     cell = wp.vec3i(int(wp.floor(at[0])), int(wp.floor(at[1])), int(wp.floor(at[2])))
     for axis in range(3):
@@ -31,15 +31,15 @@ def _cell(at: wp.vec3, shape: wp.vec3i):
 
 @wp.kernel
 def mark_rays(
-    directions: wp.array(dtype=wp.vec3),  # at depth 1 m, in cells
-    depths: wp.array(dtype=float),
+    directions: wp.array[wp.vec3],  # at depth 1 m, in cells
+    depths: wp.array[float],
     start: wp.vec3,  # of all rays, in cells of ``marks``
     shape: wp.vec3i,  # of ``marks``
     cell_m: float,
     reach_m: float,
     mark: int,
-    marks: wp.array3d(dtype=wp.int8),
-):
+    marks: wp.array3d[wp.int8],
+) -> None:
     """Put one kind of mark on the cells of every ray."""
     ray = wp.tid()
     depth = depths[ray]
@@ -60,7 +60,7 @@ def mark_rays(
 
 
 @wp.func
-def _value(cells: wp.array3d(dtype=wp.int8), cell: wp.vec3i):
+def _value(cells: wp.array3d[wp.int8], cell: wp.vec3i) -> int:
     """Of a cell; 0 beyond the grid."""
     value = wp.int32(0)
     if cell[0] >= 0:
@@ -69,7 +69,7 @@ def _value(cells: wp.array3d(dtype=wp.int8), cell: wp.vec3i):
 
 
 @wp.func
-def _still_blank(blanks: wp.array3d(dtype=wp.int8), cell: wp.vec3i):
+def _still_blank(blanks: wp.array3d[wp.int8], cell: wp.vec3i) -> float:
     """Share of an unknown cell that still counts after the frames that found nothing there."""
     share = wp.float32(1.0)
     looks = _value(blanks, cell)
@@ -80,16 +80,16 @@ def _still_blank(blanks: wp.array3d(dtype=wp.int8), cell: wp.vec3i):
 
 @wp.kernel
 def sum_unknown(
-    directions: wp.array(dtype=wp.vec3),  # in the camera frame, z = 1 m
-    rotations: wp.array(dtype=wp.mat33),  # to the world, in cells
-    starts: wp.array(dtype=wp.vec3),  # in cells
-    log_odds: wp.array3d(dtype=wp.int8),
-    blanks: wp.array3d(dtype=wp.int8),
+    directions: wp.array[wp.vec3],  # in the camera frame, z = 1 m
+    rotations: wp.array[wp.mat33],  # to the world, in cells
+    starts: wp.array[wp.vec3],  # in cells
+    log_odds: wp.array3d[wp.int8],
+    blanks: wp.array3d[wp.int8],
     cell_m: float,
     reach_m: float,
-    gains: wp.array2d(dtype=float),
-    depths: wp.array2d(dtype=float),
-):
+    gains: wp.array2d[float],
+    depths: wp.array2d[float],
+) -> None:
     """Unknown length of each ray of each pose, weighed by z^2 and by the chance to see it.
 
     And the depth of the first occupied cell that it meets, 0 if none.
@@ -116,17 +116,17 @@ def sum_unknown(
 
 @wp.kernel
 def sum_unknown_held(
-    directions: wp.array(dtype=wp.vec3),  # in the camera frame, z = 1 m
-    rotations: wp.array2d(dtype=wp.mat33),  # (motions, steps) to the world, in cells
-    starts: wp.array2d(dtype=wp.vec3),  # in cells
-    log_odds: wp.array3d(dtype=wp.int8),
-    blanks: wp.array3d(dtype=wp.int8),
+    directions: wp.array[wp.vec3],  # in the camera frame, z = 1 m
+    rotations: wp.array2d[wp.mat33],  # (motions, steps) to the world, in cells
+    starts: wp.array2d[wp.vec3],  # in cells
+    log_odds: wp.array3d[wp.int8],
+    blanks: wp.array3d[wp.int8],
     cell_m: float,
     reach_m: float,
     low: wp.vec3,  # cell in which the first block begins
-    first_seen: wp.array4d(dtype=wp.int8),  # (motions, blocks) in which step, from 1; 0: in none
-    gains: wp.array2d(dtype=float),  # (motions, steps)
-):
+    first_seen: wp.array4d[wp.int8],  # (motions, blocks) in which step, from 1; 0: in none
+    gains: wp.array2d[float],  # (motions, steps)
+) -> None:
     """As `sum_unknown`, along motions that are held; a block counts in the first step it is seen.
 
     A motion ends where the camera would stand in a cell that is not known to be free.
@@ -167,13 +167,13 @@ def sum_unknown_held(
 
 @wp.kernel
 def sum_information(
-    depth: wp.array3d(dtype=float),
-    normals: wp.array3d(dtype=wp.vec3),
-    lengths: wp.array(dtype=float),
+    depth: wp.array3d[float],
+    normals: wp.array3d[wp.vec3],
+    lengths: wp.array[float],
     focal: wp.vec2,
     centre: wp.vec2,
-    sums: wp.array2d(dtype=mat66),
-):
+    sums: wp.array2d[mat66],
+) -> None:
     """Sum of J^T J / sigma^2 over a row of each view, rotations times the view's length."""
     view, v = wp.tid()
     H = mat66()
@@ -192,16 +192,16 @@ def sum_information(
 
 @wp.kernel
 def sum_remaining(
-    depth: wp.array2d(dtype=float),
-    normals: wp.array2d(dtype=wp.vec3),
-    T_there_here: wp.array(dtype=wp.mat44),
+    depth: wp.array2d[float],
+    normals: wp.array2d[wp.vec3],
+    T_there_here: wp.array[wp.mat44],
     length: float,
     nearest: float,  # metres: what is nearer counts as near
     focal: wp.vec2,
     centre: wp.vec2,
-    sums: wp.array2d(dtype=mat66),
-    counts: wp.array2d(dtype=wp.vec2),  # pixels that remain, and near ones among them
-):
+    sums: wp.array2d[mat66],
+    counts: wp.array2d[wp.vec2],  # pixels that remain, and near ones among them
+) -> None:
     """As `sum_information`, of those pixels of one view that others, near by, show as well."""
     there, v = wp.tid()
     H = mat66()
@@ -227,12 +227,12 @@ def sum_remaining(
 
 @wp.kernel
 def count_states(
-    log_odds: wp.array3d(dtype=wp.int8),
+    log_odds: wp.array3d[wp.int8],
     rotation: wp.mat33,  # from blocks to cells
     start: wp.vec3,  # corner of the first block, in cells
     samples: int,  # along an edge of a block
-    shares: wp.array4d(dtype=float),
-):
+    shares: wp.array4d[float],
+) -> None:
     """Shares of free (0) and occupied (1) places in each block."""
     i, j, k = wp.tid()
     shape = wp.vec3i(log_odds.shape[0], log_odds.shape[1], log_odds.shape[2])

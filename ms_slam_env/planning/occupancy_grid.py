@@ -8,15 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float32, Float64, Int64
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.planning.kernels import BLANK, PASSED, STRUCK, count_states, mark_rays
 from ms_slam_env.slam.shared.submap_frames import Submaps
 from ms_slam_env.slam.slam_backend import SlamBackend
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 
@@ -125,8 +123,6 @@ class OccupancyGrid:
         log_odds[box], blanks[box] = self.log_odds, self.blanks
         self.first, self.log_odds, self.blanks = first, log_odds, blanks
 
-
-Float32 = NDArray[np.float32]
 
 _MOST_SAMPLES = 5
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.planning.kernels import mat66, sum_information, sum_remaining
 from ms_slam_env.slam.slam_backend import Views
-
-Float64 = NDArray[np.float64]
 
 
 def view_information(views: Views) -> Float64:

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import dijkstra
 
+from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.planning.expected_gain import expected_gain
 from ms_slam_env.planning.occupancy_grid import OccupancyGrid
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 _NEIGHBOURS = ndimage.generate_binary_structure(3, 1)
 

@@ -1,20 +1,19 @@
-"""Medians with bootstrap intervals, and rliable's aggregates across scenes."""
+"""Medians with bootstrap intervals, and the aggregates across scenes of Agarwal et al. (2021).
+
+The latter are those of their library rliable 1.2.0, to the last bit: the same draws.
+"""
 
 from __future__ import annotations
 
-import importlib.util
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float64 = NDArray[np.float64]
-Key = TypeVar("Key")
+from ms_slam_env._runtime.arrays import Float64
 
 CONFIDENCE = 0.95
 _PERCENTILES = (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE))
@@ -103,13 +102,8 @@ def rank_correlation(a: ArrayLike, b: ArrayLike) -> float:
     return float(stats.spearmanr(a, b).statistic)
 
 
-def has_rliable() -> bool:
-    """Whether the extra ``statistics`` is installed."""
-    return importlib.util.find_spec("rliable") is not None
-
-
 def interquartile_mean(scores: Float64) -> float:
-    """Mean of the middle half of scores (episodes, scenes): rliable's ``aggregate_iqm``, faster."""
+    """Mean of the middle half of scores (episodes, scenes): rliable's ``aggregate_iqm``."""
     ordered = np.sort(scores, axis=None)
     cut = len(ordered) // 4
     return float(ordered[cut : len(ordered) - cut].mean())
@@ -121,8 +115,11 @@ def interquartile_means(scores: Mapping[str, Float64]) -> dict[str, Interval]:
     Args:
         scores: planner to (episodes, scenes).
     """
-    found = _rliable_intervals(scores, lambda x: np.array([interquartile_mean(x)]))
-    return {name: of for name, (of,) in found.items()}
+    rng = np.random.RandomState(0)
+    return {
+        name: _stratified_bootstrap([of], lambda x: np.array([interquartile_mean(x)]), rng)[0]
+        for name, of in scores.items()
+    }
 
 
 def improvement_matrix(scores: Mapping[str, Float64]) -> dict[tuple[str, str], Interval]:
@@ -139,7 +136,7 @@ def improvement_matrix(scores: Mapping[str, Float64]) -> dict[tuple[str, str], I
         by_scene = [np.ascontiguousarray(of.T) for of in resampled]  # long rows compare faster
         return np.array([_improvement(a, b) for a, b in combinations(by_scene, 2)])
 
-    found = _rliable_intervals({"all": list(scores.values())}, of_all)["all"]
+    found = _stratified_bootstrap(list(scores.values()), of_all, np.random.RandomState(0))
     return _both_ways(dict(zip(combinations(scores, 2), found, strict=True)))
 
 
@@ -182,39 +179,32 @@ def _both_ways(pairs: Mapping[tuple[str, str], Interval]) -> dict[tuple[str, str
 
 
 def _improvement(a: Float64, b: Float64) -> float:
-    """rliable's ``probability_of_improvement`` of (scenes, m) over (scenes, n), faster."""
+    """rliable's ``probability_of_improvement`` of (scenes, m) over (scenes, n)."""
     a, b = a[:, :, None], b[:, None]
     more, less = np.count_nonzero(a > b), np.count_nonzero(a < b)
     return 0.5 + 0.5 * (more - less) / (a.size * b.shape[2])
 
 
-def _rliable_intervals(
-    scores: Mapping[Key, Float64 | list[Float64]], aggregate: Callable[..., Float64]
-) -> dict[Key, list[Interval]]:
-    """Intervals of what ``aggregate`` makes of scores, (k,), by key."""
-    from rliable import library
+def _stratified_bootstrap(
+    scores: Sequence[Float64],
+    aggregate: Callable[..., Float64],
+    rng: np.random.RandomState,
+) -> list[Interval]:
+    """Percentile intervals of what ``aggregate`` makes of ``scores``, (k,).
 
-    with _global_numpy_seed(0), warnings.catch_warnings():
-        # The generator that rliable passes on is one that the library below wants to drop.
-        warnings.simplefilter("ignore", FutureWarning)
-        values, intervals = library.get_interval_estimates(
-            scores, aggregate, reps=_RESAMPLES, random_state=np.random.RandomState(0)
-        )
-    return {
-        name: [Interval(*map(float, of)) for of in zip(values[name], *intervals[name], strict=True)]
-        for name in scores
-    }
+    A resample draws the episodes of each planner and scene anew, from the stream that rliable
+    draws from: the tables that it made stay as they are.
 
-
-@contextmanager
-def _global_numpy_seed(seed: int) -> Iterator[None]:
-    """Seed NumPy's global generator, and put its former state back at the end.
-
-    rliable 1.2.0 draws the strata's resamples from it, whatever ``random_state`` it is given.
+    Args:
+        scores: (episodes, scenes) each.
+        aggregate: of as many resampled ones.
+        rng: where the draws come from.
     """
-    before = np.random.get_state()  # noqa: NPY002
-    np.random.seed(seed)  # noqa: NPY002
-    try:
-        yield
-    finally:
-        np.random.set_state(before)  # noqa: NPY002
+    drawn = np.array(
+        [
+            aggregate(*(np.take_along_axis(of, rng.choice(len(of), of.shape), 0) for of in scores))
+            for _ in range(_RESAMPLES)
+        ]
+    )
+    limits = np.percentile(drawn, _PERCENTILES, axis=0)
+    return [Interval(*map(float, of)) for of in zip(aggregate(*scores), *limits, strict=True)]

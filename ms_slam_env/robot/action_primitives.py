@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, make_pose, so3_exp
+from ms_slam_env.geometry import make_pose, so3_exp
 
 TRANSLATIONS = ("none", "up", "down", "left", "right", "forward", "backward")
 ROTATIONS = (

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.geometry import Float64, make_pose, so3_exp, so3_log
+from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env.geometry import make_pose, so3_exp, so3_log
 
 FRAME_PERIOD_S = 1 / 30
 """Time between frames of a camera whose carrier has no clock of its own."""

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import UnreachableError
-from ms_slam_env.geometry import Float64, invert
+from ms_slam_env.geometry import invert
 from ms_slam_env.robot.action_primitives import (
     NUM_ROTATIONS,
     NUM_TRANSLATIONS,

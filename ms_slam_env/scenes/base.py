@@ -8,11 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.geometry import Float64
+from ms_slam_env._runtime.arrays import Bool, Float32, Float64, Int32
 
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Bool = NDArray[np.bool_]
 Rng = np.random.Generator
 
 _FLOOR = "floor"

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ms_slam_env.scenes.base import Float32, Float64, Int32, Rng, TexturedMesh
+from ms_slam_env._runtime.arrays import Float32, Float64, Int32
+from ms_slam_env.scenes.base import Rng, TexturedMesh
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ms_slam_env.scenes.base import Bool, Float32, Float64
+from ms_slam_env._runtime.arrays import Bool, Float32, Float64
 from ms_slam_env.scenes.mesh_queries import RayCaster
 
 VOXEL_M = 0.05

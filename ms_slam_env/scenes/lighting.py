@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from ms_slam_env.scenes.base import Float32, Float64, TexturedMesh
+from ms_slam_env._runtime.arrays import Float32, Float64
+from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.scenes.builder import Geometry, MeshBuilder
 from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Float64, Rng
+from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.furniture import decor, pieces, small_things
 from ms_slam_env.scenes.lighting import Lamp, Lighting, Panel, Sun, light_and_expose

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes import mesh_cache
-from ms_slam_env.scenes.base import Float64, Rng, TexturedMesh
+from ms_slam_env.scenes.base import Rng, TexturedMesh
 from ms_slam_env.scenes.builder import Geometry
 from ms_slam_env.scenes.free_space import Enclosed, FreeSpace, voxel_for
 from ms_slam_env.scenes.lighting import Lamp, Lighting, auto_exposure, light_mesh

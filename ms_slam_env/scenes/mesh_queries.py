@@ -9,7 +9,8 @@ from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from numpy.typing import NDArray
 
-from ms_slam_env.scenes.base import Float64, TexturedMesh
+from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env.scenes.base import TexturedMesh
 
 
 class RayCaster:

@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Bool, Float64, Int32
 from ms_slam_env.geometry import look_at, so3_exp
-from ms_slam_env.scenes.base import Bool, Float64, Int32, Rng, Scene, TexturedMesh
+from ms_slam_env.scenes.base import Rng, Scene, TexturedMesh
 from ms_slam_env.scenes.free_space import VOXEL_M, FreeSpace, Holding
 from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross, sample_surface
 

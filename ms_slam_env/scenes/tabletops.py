@@ -9,7 +9,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ms_slam_env.scenes.base import Float64, Rng
+from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.furniture import decor, pieces, small_things
 from ms_slam_env.scenes.lighting import Light, Lighting, Panel, Sun, light_and_expose

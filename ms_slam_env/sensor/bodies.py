@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import wp
-from ms_slam_env.geometry import Float64, invert
+from ms_slam_env.geometry import invert
 from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.scenes.mesh_queries import face_cross
 from ms_slam_env.sensor.casters import RayCaster

@@ -8,15 +8,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env._runtime.warp import wp
-from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.sensor.bodies import Body, BodyCast
 from ms_slam_env.sensor.casters import RayCaster
 from ms_slam_env.sensor.rays import Hits, Pinhole, keep_nearer
 from ms_slam_env.sensor.shading import Surfaces
-
-Float32 = NDArray[np.float32]
 
 _GATHER = 0.2  # of the way from a corner to the middle of its face: there light is gathered
 _LIFT_M = 0.006

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.native import native_source
 from ms_slam_env.sensor.native import VECTOR_FLAGS
@@ -54,12 +54,12 @@ def make_depth_noise(config: NoiseConfig, intrinsics: Intrinsics) -> DepthNoise:
 
 @wp.kernel
 def projector_shadow(
-    hit_t: wp.array(dtype=wp.float32),  # (B * H * W,)
-    hit_face: wp.array(dtype=wp.int32),
+    hit_t: wp.array[wp.float32],  # (B * H * W,)
+    hit_face: wp.array[wp.int32],
     width: int,
     noise: DepthNoise,
-    shadow: wp.array(dtype=wp.uint8),  # (B * H * W,)
-):
+    shadow: wp.array[wp.uint8],  # (B * H * W,)
+) -> None:
     """Mark what the projector, right of the camera, does not reach; one thread per image row.
 
     The projector sees a point of native column c and depth z in its own column c - f b / z. Along
@@ -94,34 +94,34 @@ def _measure_span(
     y: int,
     x_first: int,
     count: int,
-    hit_t: wp.array(dtype=wp.float32),
-    hit_face: wp.array(dtype=wp.int32),
-    face_normal: wp.array(dtype=wp.vec3),
-    face_plane: wp.array(dtype=wp.float32),
-    shadow: wp.array(dtype=wp.uint8),
+    hit_t: wp.array[wp.float32],
+    hit_face: wp.array[wp.int32],
+    face_normal: wp.array[wp.vec3],
+    face_plane: wp.array[wp.float32],
+    shadow: wp.array[wp.uint8],
     noise: DepthNoise,
     key_0: wp.uint32,
     key_1: wp.uint32,
-    normals: wp.array(dtype=wp.float32),
-    depth: wp.array(dtype=wp.float32),
-): ...
+    normals: wp.array[wp.float32],
+    depth: wp.array[wp.float32],
+) -> None: ...
 
 
 @wp.kernel
 def measure_depth(
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
+    T_world_camera: wp.array[wp.mat44],  # (B * poses an image,)
     camera: Pinhole,
     span: int,
-    hit_t: wp.array(dtype=wp.float32),  # (B * H * W,)
-    hit_face: wp.array(dtype=wp.int32),
-    face_normal: wp.array(dtype=wp.vec3),  # (F,)
-    face_plane: wp.array(dtype=wp.float32),  # (F,)
-    shadow: wp.array(dtype=wp.uint8),  # (B * H * W,)
+    hit_t: wp.array[wp.float32],  # (B * H * W,)
+    hit_face: wp.array[wp.int32],
+    face_normal: wp.array[wp.vec3],  # (F,)
+    face_plane: wp.array[wp.float32],  # (F,)
+    shadow: wp.array[wp.uint8],  # (B * H * W,)
     noise: DepthNoise,
-    keys: wp.array2d(dtype=wp.uint32),  # (B, 2)
-    normals: wp.array(dtype=wp.float32),  # quantiles of N(0, 1)
-    depth: wp.array(dtype=wp.float32),  # (B * H * W,)
-):
+    keys: wp.array2d[wp.uint32],  # (B, 2)
+    normals: wp.array[wp.float32],  # quantiles of N(0, 1)
+    depth: wp.array[wp.float32],  # (B * H * W,)
+) -> None:
     """Jitter, dropouts, range, axial noise, quantisation; one thread for ``span`` pixels."""
     b, y, part = wp.tid()
     x = part * span

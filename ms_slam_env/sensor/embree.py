@@ -17,7 +17,7 @@ import numpy as np
 from embreex import rtcore_scene
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
 from ms_slam_env.sensor.native import VECTOR_FLAGS
 from ms_slam_env.sensor.rays import Hits, Pinhole, pose_of_row
@@ -123,27 +123,27 @@ TILE_HEIGHT = 2
 def _cast_tile(
     intersect: wp.uint64,
     scene: wp.uint64,
-    vertices: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
+    vertices: wp.array[wp.vec3],
+    faces: wp.array[wp.vec3i],
     T: wp.mat44,
     camera: Pinhole,
     image: int,
     tile_y: int,
     tile_x: int,
     hits: Hits,
-): ...
+) -> None: ...
 
 
 @wp.kernel
 def cast_tiles(
     intersect: wp.uint64,  # address of rtcIntersect8
     scene: wp.uint64,  # address of the RTCScene
-    vertices: wp.array(dtype=wp.vec3),  # (V,)
-    faces: wp.array(dtype=wp.vec3i),  # (F,)
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
+    vertices: wp.array[wp.vec3],  # (V,)
+    faces: wp.array[wp.vec3i],  # (F,)
+    T_world_camera: wp.array[wp.mat44],  # (B * poses an image,)
     camera: Pinhole,
     hits: Hits,  # of B * H * W rays
-):
+) -> None:
     """First hit of the ray of each pixel; face -1 where there is none; one thread a tile."""
     b, y, x = wp.tid()
     T = T_world_camera[pose_of_row(camera, b, 2 * y)]  # the rows of a tile share their pose

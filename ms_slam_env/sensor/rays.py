@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 
 
@@ -24,17 +24,17 @@ class Pinhole:
     width: wp.int32
     height: wp.int32
     rows: wp.int32  # that share a pose; ``height`` unless the shutter rolls
-    bent: wp.array(dtype=wp.vec2)  # (H * W,) x and y at z = 1; empty without a lens
+    bent: wp.array[wp.vec2]  # (H * W,) x and y at z = 1; empty without a lens
 
 
 @wp.struct
 class Hits:
     """First hit of each of N rays, overwritten by the next cast."""
 
-    t: wp.array(dtype=wp.float32)  # (N,) ray parameter: the depth; undefined where face is -1
-    u: wp.array(dtype=wp.float32)  # (N,) barycentric weight of the face's second corner
-    v: wp.array(dtype=wp.float32)  # (N,) and of its third
-    face: wp.array(dtype=wp.int32)  # (N,) index of the face, -1 where the ray meets nothing
+    t: wp.array[wp.float32]  # (N,) ray parameter: the depth; undefined where face is -1
+    u: wp.array[wp.float32]  # (N,) barycentric weight of the face's second corner
+    v: wp.array[wp.float32]  # (N,) and of its third
+    face: wp.array[wp.int32]  # (N,) index of the face, -1 where the ray meets nothing
 
 
 def make_hits(count: int, device: str) -> Hits:
@@ -95,11 +95,11 @@ def camera_centre(T: wp.mat44) -> wp.vec3:
 
 @wp.kernel
 def generate_rays(
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
+    T_world_camera: wp.array[wp.mat44],  # (B * poses an image,)
     camera: Pinhole,
-    origins: wp.array(dtype=wp.vec3),  # (B * H * W,)
-    directions: wp.array(dtype=wp.vec3),  # (B * H * W,)
-):
+    origins: wp.array[wp.vec3],  # (B * H * W,)
+    directions: wp.array[wp.vec3],  # (B * H * W,)
+) -> None:
     """One ray per pixel."""
     b, y, x = wp.tid()
     T = T_world_camera[pose_of_row(camera, b, y)]
@@ -111,10 +111,10 @@ def generate_rays(
 @wp.kernel
 def cast_rays(
     mesh: wp.uint64,
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
+    T_world_camera: wp.array[wp.mat44],  # (B * poses an image,)
     camera: Pinhole,
     hits: Hits,  # of B * H * W rays
-):
+) -> None:
     """First hit of the ray of each pixel; face -1 where there is none."""
     b, y, x = wp.tid()
     T = T_world_camera[pose_of_row(camera, b, y)]
@@ -138,8 +138,8 @@ def keep_nearer(
     first_face: int,
     faces_a_pose: int,
     hits: Hits,  # of H * W rays
-    posed_face: wp.array(dtype=wp.int32),
-):
+    posed_face: wp.array[wp.int32],
+) -> None:
     """Where a body is hit before anything else, its hit takes the place of the other."""
     _, y, x = wp.tid()
     i = y * camera.width + x

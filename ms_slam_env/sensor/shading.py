@@ -6,7 +6,7 @@ Raw-Data", IEEE TIP 2008.
 
 from __future__ import annotations
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
 from ms_slam_env.sensor.native import VECTOR_FLAGS
 from ms_slam_env.sensor.rays import Hits, Pinhole, camera_centre, pose_of_row, world_ray
@@ -21,25 +21,25 @@ wp.set_module_options(VECTOR_FLAGS)
 class Surfaces:
     """What shading needs to know of a mesh, per face or per texture."""
 
-    uv: wp.array2d(dtype=wp.vec2)  # (F, 3)
-    irradiance: wp.array2d(dtype=wp.vec3)  # (F, 3)
-    normal: wp.array(dtype=wp.vec3)  # (F,)
-    plane: wp.array(dtype=wp.float32)  # (F,) normal . x
-    density: wp.array(dtype=wp.float32)  # (F,) texels per metre
-    texture: wp.array(dtype=wp.int32)  # (F,)
-    label: wp.array(dtype=wp.int32)  # (F,)
-    texels: wp.array(dtype=wp.uint32)  # packed levels of all textures
-    offsets: wp.array2d(dtype=wp.int32)  # (T, L)
-    sizes: wp.array(dtype=wp.vec3i)  # (T,) width, height, levels
+    uv: wp.array2d[wp.vec2]  # (F, 3)
+    irradiance: wp.array2d[wp.vec3]  # (F, 3)
+    normal: wp.array[wp.vec3]  # (F,)
+    plane: wp.array[wp.float32]  # (F,) normal . x
+    density: wp.array[wp.float32]  # (F,) texels per metre
+    texture: wp.array[wp.int32]  # (F,)
+    label: wp.array[wp.int32]  # (F,)
+    texels: wp.array[wp.uint32]  # packed levels of all textures
+    offsets: wp.array2d[wp.int32]  # (T, L)
+    sizes: wp.array[wp.vec3i]  # (T,) width, height, levels
 
 
 @wp.struct
 class Tables:
     """Functions of one number, tabulated."""
 
-    normals: wp.array(dtype=wp.float32)  # quantiles of N(0, 1)
-    decode: wp.array(dtype=wp.float32)  # sRGB to linear
-    encode: wp.array(dtype=wp.float32)  # linear to sRGB
+    normals: wp.array[wp.float32]  # quantiles of N(0, 1)
+    decode: wp.array[wp.float32]  # sRGB to linear
+    encode: wp.array[wp.float32]  # linear to sRGB
 
 
 @wp.func_native(
@@ -60,13 +60,13 @@ def _shade_span(
     key_0: wp.uint32,
     key_1: wp.uint32,
     tables: Tables,
-    color: wp.array2d(dtype=wp.uint8),
-): ...
+    color: wp.array2d[wp.uint8],
+) -> None: ...
 
 
 @wp.kernel
 def shade(
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
+    T_world_camera: wp.array[wp.mat44],  # (B * poses an image,)
     camera: Pinhole,
     span: int,
     hits: Hits,  # of B * H * W rays
@@ -74,10 +74,10 @@ def shade(
     exposure: float,
     shot: float,
     read: float,
-    keys: wp.array2d(dtype=wp.uint32),  # (B, 2)
+    keys: wp.array2d[wp.uint32],  # (B, 2)
     tables: Tables,
-    color: wp.array2d(dtype=wp.uint8),  # (B * H * W, 3)
-):
+    color: wp.array2d[wp.uint8],  # (B * H * W, 3)
+) -> None:
     """Sensor value = exposure * radiance + noise; one thread for ``span`` pixels of a row."""
     b, y, part = wp.tid()
     first = b * camera.height * camera.width
@@ -104,15 +104,15 @@ def shade(
 
 @wp.kernel
 def true_geometry(
-    T_world_camera: wp.array(dtype=wp.mat44),  # (B * poses an image,)
+    T_world_camera: wp.array[wp.mat44],  # (B * poses an image,)
     camera: Pinhole,
     hits: Hits,  # of B * H * W rays
     surfaces: Surfaces,
-    depth: wp.array(dtype=wp.float32),  # (B * H * W,)
-    normals: wp.array(dtype=wp.vec3),  # camera frame, towards the camera
-    labels: wp.array(dtype=wp.int32),
-    points: wp.array(dtype=wp.vec3),  # world frame
-):
+    depth: wp.array[wp.float32],  # (B * H * W,)
+    normals: wp.array[wp.vec3],  # camera frame, towards the camera
+    labels: wp.array[wp.int32],
+    points: wp.array[wp.vec3],  # world frame
+) -> None:
     """Write depth, normal, label and point of each hit; 0 and label -1 where there is none."""
     b, y, x = wp.tid()
     i = (b * camera.height + y) * camera.width + x

@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float32
 from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.scenes.lighting import linear_to_srgb, srgb_to_linear
 from ms_slam_env.scenes.mesh_queries import face_cross
-
-Float32 = NDArray[np.float32]
 
 ENCODE_STEPS = 4096
 """Intervals of the linear-to-sRGB table."""

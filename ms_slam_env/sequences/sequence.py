@@ -12,9 +12,9 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError, InputWarning
-from ms_slam_env.geometry import Float64
 
 
 class Frames(collections.abc.Sequence[RGBDFrame]):

@@ -7,20 +7,18 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env._runtime.input_files import read_text, words_of
 from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.geometry import (
     MAX_COORDINATE_M,
-    Float64,
     check_pose,
     pose_from_quaternion,
     quaternion_from_pose,
 )
-
-Int64 = NDArray[np.int64]
 
 MAX_DIFFERENCE_S = 0.02
 """Timestamps further apart do not belong together (the tolerance of the TUM tools)."""

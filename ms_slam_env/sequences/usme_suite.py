@@ -19,10 +19,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ms_slam_env import __version__, scenes
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.input_files import read_json
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import parse_named
@@ -34,7 +32,6 @@ from ms_slam_env.sequences.writing import DESCRIPTION, write_sequence
 if TYPE_CHECKING:
     from ms_slam_env.sequences import Perturbation, RenderedSequence
 
-Float64 = NDArray[np.float64]
 
 _OUTDOORS = {"rate_hz": 15.0, "speed_m_s": 1.4, "turn_deg_s": 25.0}
 _AROUND = ("SW-S", "S", "SE", "E", "NE", "N", "NW", "W")

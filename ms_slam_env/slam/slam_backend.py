@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import as_numbers
@@ -19,10 +20,6 @@ from ms_slam_env.slam.shared.state import Stateful
 from ms_slam_env.slam.shared.state_check import check_like
 from ms_slam_env.slam.shared.state_file import read_state, write_state
 from ms_slam_env.slam.shared.submap_frames import Submaps, one_submap
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-
 
 LARGEST_CUTOFF_M = 12.0
 """Of depth, by any backend: as far as a sensor model reads (``RangeNoise``)."""

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ms_slam_env.tuning.objectives import METRICS
+from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env.tuning.objectives import METRICS, on_front
 from ms_slam_env.tuning.study_storage import StudyStorage
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -69,11 +68,8 @@ def front_of(points: Sequence[Point], metrics: Sequence[str]) -> list[Point]:
     """Those of ``points`` that none beats in ``metrics``, in the order of the last of them."""
     known = [p for p in points if all(p.measured.get(name) is not None for name in metrics)]
     told = [[METRICS[name].told(p.measured[name]) for name in metrics] for p in known]
-    values = np.array(told).reshape(len(known), len(metrics))
-    beaten = [
-        bool(np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1))) for own in values
-    ]
-    best = [p for p, is_beaten in zip(known, beaten, strict=True) if not is_beaten]
+    unbeaten = on_front(np.array(told).reshape(len(known), len(metrics)))
+    best = [p for p, is_best in zip(known, unbeaten, strict=True) if is_best]
     return sorted(best, key=lambda point: float(point.measured[metrics[-1]]))
 
 

@@ -8,6 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from ms_slam_env._runtime.arrays import Bool, Float64
 from ms_slam_env.errors import InputError, unknown
 
 Measured = Mapping[str, Any]
@@ -150,3 +153,11 @@ def objective_values(
         else:
             values.append(min(METRICS[name].told(float(value)), reference[name]))
     return values
+
+
+def on_front(values: Float64) -> Bool:
+    """(n,) which of ``values`` (n, d) no other beats: as small in all, and smaller in one."""
+    beaten = [
+        np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1)) for own in values
+    ]
+    return ~np.array(beaten, dtype=np.bool_)

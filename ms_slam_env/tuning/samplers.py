@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.records import RecordFile, spec_key
 from ms_slam_env.tuning.evaluator import Row, SlamEvaluator
-from ms_slam_env.tuning.objectives import FAILURE, METRICS, Measured, objective_values
+from ms_slam_env.tuning.objectives import FAILURE, METRICS, Measured, objective_values, on_front
 from ms_slam_env.tuning.parameters import Float, Integer
 from ms_slam_env.tuning.space import SearchSpace
 
@@ -146,18 +146,14 @@ def propose(space: Mapping[str, Any], done: list[Any], rng: np.random.Generator)
         values of ``space``.
     """
     from optuna._transform import _SearchSpaceTransform
-    from optuna.study._multi_objective import _is_pareto_front
     from sklearn.ensemble import RandomForestClassifier, RandomForestRegressor
-
-    def front(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return _is_pareto_front(values, assume_unique_lexsorted=False)
 
     coded = _SearchSpaceTransform(dict(space), transform_0_1=True)
     points = np.array([coded.transform({n: t.params[n] for n in space}) for t in done])
     values = np.array([trial.values for trial in done], dtype=np.float64)
     kept = np.array([all(v <= 0 for v in trial.constraints.values()) for trial in done])
     learnt = kept if kept.sum() >= 2 else np.ones(len(done), dtype=bool)
-    best = points[learnt][front(values[learnt])]
+    best = points[learnt][on_front(values[learnt])]
     pool = np.vstack([rng.random((_POOL, points.shape[1])), _changed(best, rng)])
     seed = int(rng.integers(2**31))
     if kept.any() and not kept.all():
@@ -173,7 +169,7 @@ def propose(space: Mapping[str, Any], done: list[Any], rng: np.random.Generator)
         ],
         axis=1,
     )
-    found = [coded.untransform(row) for row in pool[front(predicted)]]
+    found = [coded.untransform(row) for row in pool[on_front(predicted)]]
     known = [{name: trial.params[name] for name in space} for trial in done]
     fresh = [params for params in found if params not in known]
     return fresh[rng.integers(len(fresh))] if fresh else {}

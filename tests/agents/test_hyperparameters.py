@@ -32,7 +32,8 @@ NAMES = sorted(path.stem for path in options.TASKS.glob("*.yaml"))
 
 
 def parsed(words, trainer="ppo"):
-    return options.parse_for_task(TRAINERS[trainer], words, "ms-slam train", trainer)
+    cls = TRAINERS[trainer]
+    return resume.parse_options(cls, words, "ms-slam train", trainer, cls.algorithms)
 
 
 def test_every_task_of_the_benchmark_has_a_file():

@@ -117,13 +117,6 @@ def test_results_table_and_figures_are_written(tmp_path: Path) -> None:
     assert again.charts[0].panels[0].series[0].name == "greedy"
 
 
-def test_without_rliable_the_rest_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ms_slam_env.report.statistics.has_rliable", lambda: False)
-    titles = [table.title for table in CONFIG.tables(rows_of(CONFIG))]
-    assert "Across scenes" not in titles
-    assert "wall" in titles
-
-
 def test_losses_count_together_and_energy_only_where_something_was_moved() -> None:
     rows = rows_of(CONFIG)
     table = CONFIG.tables(rows)[0]
@@ -139,7 +132,6 @@ def test_losses_count_together_and_energy_only_where_something_was_moved() -> No
 
 
 def test_every_planner_is_compared_with_every_other() -> None:
-    pytest.importorskip("rliable")
     tables = {table.title: table for table in CONFIG.tables(rows_of(CONFIG))}
     assert tables["Sooner than each other"].rows
     table = tables["Better than each other"]
@@ -177,7 +169,6 @@ def test_from_the_same_start_pairs_are_compared_one_by_one() -> None:
 
 
 def test_policies_of_one_training_are_judged_together_too() -> None:
-    pytest.importorskip("rliable")
     scores = {"nbv": 0.5, "agent,path=a": 0.3, "agent,path=b": 0.8, "agent": 0.7, "x,path=c": 0.1}
     rows: list[Row] = [
         {"spec": {**row["spec"], "planner": name}, "result": result(score), "error": None}
@@ -242,7 +233,6 @@ def test_a_policy_that_finished_nothing_is_none_of_its_training() -> None:
 
 
 def test_planners_are_compared_by_what_the_reward_says_too() -> None:
-    pytest.importorskip("rliable")
     rows = rows_of(CONFIG)
     for row in rows:
         row["result"]["return"] = -row["result"]["f_score_5cm"]

@@ -102,6 +102,7 @@ def test_what_was_recorded_only_in_part_is_also_rendered_in_part(experiment, dat
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"data": None}, "--data is missing"),
         ({"data": Path("nowhere")}, "cannot read trajectory"),
         ({"image_size": "1x1"}, "image_size.*1x1"),
         ({"noise": ("loud",)}, "unknown noise model 'loud'"),

@@ -66,6 +66,8 @@ def test_motions_are_placed_as_they_were_and_skipped(tmp_path: Path) -> None:
     ]
     with pytest.raises(InputError, match="lr_kt9"):
         FrameSkipping(motions=("lr_kt9",), data=tmp_path).specs()
+    with pytest.raises(InputError, match="--data"):
+        FrameSkipping(motions=("lr_kt1",)).specs()
 
 
 def line(interval: int, ate_m: float, lost: float, M: float) -> dict[str, Any]:

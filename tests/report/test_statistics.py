@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from itertools import permutations
 
 import numpy as np
@@ -75,67 +76,48 @@ def test_cut_is_negative_where_the_error_grew() -> None:
 
 
 def test_interquartile_mean_is_the_mean_of_the_middle_half() -> None:
-    pytest.importorskip("rliable")
     scores = np.random.default_rng(0).permutation(np.arange(16.0)).reshape(8, 2)
     interval = statistics.interquartile_means({"a": scores})["a"]
     assert interval.value == np.arange(4, 12).mean()
     assert interval.low < interval.value < interval.high
 
 
-def test_improvement_probability_is_rliables_and_adds_up_to_one() -> None:
-    metrics = pytest.importorskip("rliable.metrics")
+def test_improvement_probability_is_mann_whitneys_and_adds_up_to_one() -> None:
     rng = np.random.default_rng(0)
     a, b = np.round(rng.normal(0.3, 1, (6, 3))), np.round(rng.normal(0, 1, (5, 3)))  # ties
     result = statistics.improvement_matrix({"a": a, "b": b})
     assert set(result) == {("a", "b"), ("b", "a")}
     there, back = result["a", "b"], result["b", "a"]
-    assert there.value == pytest.approx(metrics.probability_of_improvement(a, b))
+    assert there.value == pytest.approx(np.mean(stats.mannwhitneyu(a, b).statistic) / 30)
     assert (there.value + back.value, there.low + back.high) == pytest.approx((1, 1))
     assert there.low < there.value < there.high
 
 
 @given(arrays(np.float64, st.tuples(st.integers(1, 9), st.integers(1, 4)), elements=SCORES))
-def test_interquartile_mean_is_rliables(scores: np.ndarray) -> None:
-    metrics = pytest.importorskip("rliable.metrics")
-    assert statistics.interquartile_mean(scores) == pytest.approx(metrics.aggregate_iqm(scores))
+def test_interquartile_mean_is_a_trimmed_mean(scores: np.ndarray) -> None:
+    expected = stats.trim_mean(scores, 0.25, axis=None)
+    assert statistics.interquartile_mean(scores) == pytest.approx(expected, abs=1e-9)
 
 
-def test_pairs_of_many_planners_have_what_rliable_says_of_two() -> None:
-    """All are resampled at once; rliable's own bootstrap of one pair differs by its draws alone."""
-    library = pytest.importorskip("rliable.library")
-    metrics = pytest.importorskip("rliable.metrics")
+def test_aggregates_are_rliables() -> None:
+    """The numbers are of rliable 1.2.0 with arch 7.2.0, 2,000 resamples, ``np.random.seed(0)``."""
     rng = np.random.default_rng(2)
     scores = {name: np.round(rng.normal(k / 3, 1, (20 + k, 3)), 1) for k, name in enumerate("abcd")}
-    found = statistics.improvement_matrix(scores)
+    means = {name: astuple(of) for name, of in statistics.interquartile_means(scores).items()}
+    assert means["a"] == pytest.approx((0.11333333333333334, -0.18, 0.3766666666666667))
+    assert means["d"] == pytest.approx((0.9885714285714287, 0.6513571428571431, 1.2915))
+    for a, b, expected in (
+        ("a", "d", (0.2855072463768116, 0.20107789855072467, 0.3771829710144928)),
+        ("c", "b", (0.5927128427128427, 0.4917027417027417, 0.687238455988456)),
+    ):
+        pair = statistics.improvement_matrix({a: scores[a], b: scores[b]})
+        assert astuple(pair[a, b]) == pytest.approx(expected)
+    found = statistics.improvement_matrix(scores)  # of all at once, with other draws
     assert set(found) == set(permutations(scores, 2))
-    for a, b in (("a", "d"), ("c", "b")):
-        values, intervals = library.get_interval_estimates(
-            {"": [scores[a], scores[b]]},
-            lambda x, y: np.array([metrics.probability_of_improvement(x, y)]),
-            reps=500,
-        )
-        assert found[a, b].value == pytest.approx(values[""][0])
-        assert (found[a, b].low, found[a, b].high) == pytest.approx(intervals[""][:, 0], abs=0.03)
-
-
-def test_rliables_intervals_are_the_same_twice_and_leave_the_global_generator_alone() -> None:
-    pytest.importorskip("rliable")
-    rng = np.random.default_rng(1)
-    scores = {name: rng.normal(size=(7, 3)) for name in ("a", "b")}
-    before = np.random.get_state()  # noqa: NPY002
-    first, second = (
-        (statistics.interquartile_means(scores), statistics.improvement_matrix(scores))
-        for _ in range(2)
-    )
-    after = np.random.get_state()  # noqa: NPY002
-    assert first == second
-    assert before[0] == after[0]
-    np.testing.assert_array_equal(before[1], after[1])
-    assert before[2:] == after[2:]
+    assert astuple(found["a", "d"]) == pytest.approx((0.28551, 0.20108, 0.37718), abs=0.02)
 
 
 def test_of_one_policy_each_the_episodes_alone_are_resampled() -> None:
-    pytest.importorskip("rliable")
     rng = np.random.default_rng(3)
     scores = {name: np.round(rng.normal(k / 3, 1, (20, 3)), 1) for k, name in enumerate("abc")}
     found = statistics.improvement_of_trainings({name: of[None] for name, of in scores.items()})

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
-from ms_slam_env.geometry import Float64
 from ms_slam_env.robot.action_primitives import NUM_MOTIONS, decompose
 from ms_slam_env.robot.arm.base_placement import place_arm, reach_m, standing_chain
 from ms_slam_env.robot.arm.clearance import ClearanceField, LinkClearance

@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Bool, Float64
 from ms_slam_env.errors import InputError, UnreachableError
-from ms_slam_env.geometry import Float64, invert, make_pose, so3_exp, transform_points
+from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm.chain import Chain, with_column
 from ms_slam_env.robot.arm.clearance import ClearanceField
@@ -29,8 +29,6 @@ from ms_slam_env.robot.arm.inverse_kinematics import (
 )
 from ms_slam_env.robot.arm.model import ArmModel
 from ms_slam_env.scenes.base import Scene, enclosed, outside, words
-
-Bool = NDArray[np.bool_]
 
 COLUMN_RADIUS_M = 0.08
 """Radius of the column that carries a base above the floor."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ms_slam_env.geometry import Float64, so3_log
+from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env.geometry import so3_log
 
 RAMP = 0.2
 """Share of the duration spent speeding up, and again slowing down."""

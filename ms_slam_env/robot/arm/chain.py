@@ -9,9 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.geometry import Float64, hat
-
-Int32 = NDArray[np.int32]
+from ms_slam_env._runtime.arrays import Float64, Int32
+from ms_slam_env.geometry import hat
 
 _SHORTEST_PART_M = 0.03  # of a capsule, between two balls that cover it
 _NEIGHBOURS = 2  # links this near touch by construction, or joint limits keep them apart

@@ -8,12 +8,11 @@ import mink
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.geometry import Float64, transform_points
+from ms_slam_env._runtime.arrays import Float32, Float64
+from ms_slam_env.geometry import transform_points
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
 from ms_slam_env.scenes.free_space import trilinear
 from ms_slam_env.scenes.mesh_scene import MeshScene
-
-Float32 = NDArray[np.float32]
 
 _VOXEL_M = 0.05
 _SLACK = 0.5  # of a voxel

@@ -62,7 +62,6 @@ class ArmConfig(Checked):
         speed_m_s: speed of the camera; Kinova states 0.2 m/s for the Mico.
         speed_rad_s: rate of turn of the camera.
         joint_speed_rad_s: limit for every joint of a model that does not state its own.
-        control_hz: rate at which the controller solves the differential inverse kinematics.
         clearance_m: distance that the links keep from furniture and from each other.
         noise: imperfections: ``none``, ``default``, or the fields of :class:`ArmNoise` that differ
             from the default.
@@ -76,7 +75,6 @@ class ArmConfig(Checked):
     speed_m_s: float = bounded(0.2, 0.001, 5)
     speed_rad_s: float = bounded(math.radians(36), 0.001, 20)
     joint_speed_rad_s: float = bounded(1.0, 0.001, 20)
-    control_hz: float = bounded(20.0, 5, 500)
     clearance_m: float = bounded(0.02, 0, 0.5)
     noise: ArmNoise = field(default_factory=ArmNoise)
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ms_slam_env.geometry import Float64
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.robot.arm.cartesian_path import CartesianPath
 from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.clearance import ClearanceField, ClearanceLimit, LinkClearance
@@ -22,6 +22,8 @@ from ms_slam_env.robot.arm.model import ArmModel
 REACHED_M, REACHED_RAD = 0.002, np.radians(0.2)
 """Furthest that commanded poses may be from their path."""
 
+CONTROL_HZ = 20.0
+"""Rate at which the differential inverse kinematics is solved."""
 _SOLVED = 1  # exit flag of daqp
 _GAIN = 0.5  # share of a gap to furniture or to another link that one step may use up
 _LEEWAY_M = 0.002  # gaps are checked oftener here than by the mask
@@ -101,7 +103,7 @@ class Controller:
             least_duration_s,
         )
         if path.duration_s == 0:
-            return Plan(np.array(q)[None], 1 / config.control_hz, True, 0.0, 0.0)
+            return Plan(np.array(q)[None], 1 / CONTROL_HZ, True, 0.0, 0.0)
         plan = self._follow(path, q, [])
         spare = self.clearance.least(plan.q[checked_ticks(len(plan.q) - 1)])
         self._links.allowance_m = min(-float(spare[0]), config.clearance_m) + _LEEWAY_M
@@ -110,7 +112,7 @@ class Controller:
         return plan
 
     def _follow(self, path: CartesianPath, q: Float64, limits: Sequence[mink.Limit]) -> Plan:
-        ticks = max(2, int(np.ceil(path.duration_s * self._config.control_hz - 1e-9)))
+        ticks = max(2, int(np.ceil(path.duration_s * CONTROL_HZ - 1e-9)))
         tick_s = path.duration_s / ticks
         targets = path.at(tick_s * np.arange(1.0, ticks + 1.0))
         poses = np.concatenate(

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
-from ms_slam_env.geometry import Float64, relative_angle, transform_points
+from ms_slam_env.geometry import relative_angle, transform_points
 from ms_slam_env.robot.arm.arm import ArmEmbodiment, frame_times
 from ms_slam_env.robot.arm.config import ArmConfig
-from ms_slam_env.robot.arm.controller import Controller, Plan, checked_ticks
+from ms_slam_env.robot.arm.controller import CONTROL_HZ, Controller, Plan, checked_ticks
 from ms_slam_env.robot.arm.dynamics import ArmDynamics, Imperfections, Motion
 from ms_slam_env.robot.arm.feasibility import MOST_STRETCH
 from ms_slam_env.robot.base import MotionResult
@@ -90,7 +91,7 @@ class DynamicArm(ArmEmbodiment):
         if probe.ok[action]:
             plan = self._plan(action)
         else:
-            plan = Plan(self.q_command[None], 1 / self.config.control_hz, False, 0.0, 0.0)
+            plan = Plan(self.q_command[None], 1 / CONTROL_HZ, False, 0.0, 0.0)
         return self._execute(plan)[0]
 
     def attempt(self, action: int) -> Attempt:

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from ms_slam_env.geometry import Float64, make_pose, so3_exp
+from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.robot.arm.config import ArmNoise
 from ms_slam_env.robot.arm.model import ArmModel
 

@@ -8,7 +8,7 @@ in the order of ``REASONS`` of :mod:`ms_slam_env.robot.arm.feasibility`.
 
 from __future__ import annotations
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.robot.arm.ik_kernels import Arm, Scratch, forward, solve_waypoint
 
 OK = wp.constant(0)
@@ -26,13 +26,13 @@ _CHECKED_M = wp.constant(0.04)
 class Grid:
     """Distances around the base."""
 
-    distance: wp.array3d(dtype=float)
+    distance: wp.array3d[float]
     R_grid_base: wp.mat33  # in voxels
     t_grid_base: wp.vec3
 
 
 @wp.func
-def why_missed(arm: Arm, q: wp.array3d(dtype=float), k: int, w: int, work: Scratch):
+def why_missed(arm: Arm, q: wp.array3d[float], k: int, w: int, work: Scratch) -> int:
     """The reason why a waypoint is not reached: a joint at its limit, or else the distance."""
     found = int(UNREACHABLE)
     for i in range(arm.num_joints):
@@ -42,7 +42,7 @@ def why_missed(arm: Arm, q: wp.array3d(dtype=float), k: int, w: int, work: Scrat
 
 
 @wp.func
-def distance_at(grid: Grid, point: wp.vec3):
+def distance_at(grid: Grid, point: wp.vec3) -> float:
     """Trilinear distance at a point of the base frame; 0 off the grid."""
     p = grid.R_grid_base * point + grid.t_grid_base
     nx = grid.distance.shape[0]
@@ -71,7 +71,7 @@ def distance_at(grid: Grid, point: wp.vec3):
 
 
 @wp.func
-def furniture_deficit(arm: Arm, grid: Grid, k: int, work: Scratch):
+def furniture_deficit(arm: Arm, grid: Grid, k: int, work: Scratch) -> float:
     """Metres by which the moving links come closer to furniture than they may; <= 0 if none."""
     worst = float(-1.0e6)
     for i in range(arm.capsule_link.shape[0]):
@@ -91,7 +91,7 @@ def furniture_deficit(arm: Arm, grid: Grid, k: int, work: Scratch):
 
 
 @wp.func
-def segment_distance(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3):
+def segment_distance(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3) -> float:
     """Distance between two segments (Ericson, Real-Time Collision Detection, 5.1.9)."""
     d1 = a1 - a0
     d2 = b1 - b0
@@ -113,7 +113,7 @@ def segment_distance(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3):
 
 
 @wp.func
-def self_deficit(arm: Arm, k: int, work: Scratch):
+def self_deficit(arm: Arm, k: int, work: Scratch) -> float:
     """Metres by which two links come closer than they may; <= 0 if none do."""
     worst = float(-1.0e6)
     for i in range(arm.pair.shape[0]):
@@ -131,7 +131,7 @@ def self_deficit(arm: Arm, k: int, work: Scratch):
 
 
 @wp.func
-def place_capsules(arm: Arm, k: int, work: Scratch):
+def place_capsules(arm: Arm, k: int, work: Scratch) -> float:
     """Ends of the capsules in the base frame, from the links' poses; how far the farthest moved."""
     farthest = float(0.0)
     for i in range(arm.capsule_link.shape[0]):
@@ -148,7 +148,7 @@ def place_capsules(arm: Arm, k: int, work: Scratch):
 
 
 @wp.func
-def collision(arm: Arm, grid: Grid, k: int, work: Scratch, deficit: wp.array(dtype=float)):
+def collision(arm: Arm, grid: Grid, k: int, work: Scratch, deficit: wp.array[float]) -> int:
     """The reason against the capsules where they are now, or ``OK``."""
     if furniture_deficit(arm, grid, k, work) > deficit[0]:
         return FURNITURE
@@ -161,12 +161,12 @@ def collision(arm: Arm, grid: Grid, k: int, work: Scratch, deficit: wp.array(dty
 def collision_on_part(
     arm: Arm,
     grid: Grid,
-    q: wp.array3d(dtype=float),
+    q: wp.array3d[float],
     k: int,
     w: int,
     work: Scratch,
-    deficit: wp.array(dtype=float),
-):
+    deficit: wp.array[float],
+) -> int:
     """The reason against the part that ends at waypoint ``w``, or ``OK``.
 
     Where a link moves far between two waypoints places between them are checked too.
@@ -193,10 +193,10 @@ def start_deficits(
     arm: Arm,
     grid: Grid,
     work: Scratch,
-    q: wp.array3d(dtype=float),
+    q: wp.array3d[float],
     most: float,
-    deficit: wp.array(dtype=float),
-):
+    deficit: wp.array[float],
+) -> None:
     """How much closer to furniture and to itself the arm may come because it already is."""
     forward(arm, q, 0, 0, work)
     place_capsules(arm, 0, work)
@@ -211,18 +211,18 @@ def follow(
     work: Scratch,
     R_start: wp.mat33,
     t_start: wp.vec3,
-    step: wp.array(dtype=wp.vec3),
-    turn: wp.array(dtype=wp.vec3),
-    duration_s: wp.array(dtype=float),
-    deficit: wp.array(dtype=float),
+    step: wp.array[wp.vec3],
+    turn: wp.array[wp.vec3],
+    duration_s: wp.array[float],
+    deficit: wp.array[float],
     damping: float,
     limit_margin: float,
     most_stretch: float,
-    share: wp.array(dtype=float),
-    q: wp.array3d(dtype=float),
-    stretch: wp.array(dtype=float),
-    reason: wp.array(dtype=int),
-):
+    share: wp.array[float],
+    q: wp.array3d[float],
+    stretch: wp.array[float],
+    reason: wp.array[int],
+) -> None:
     """Follow one candidate's path; ``q`` (k, W, n) holds the start in its first waypoint.
 
     ``share`` (W,) is how much of the path is made at each waypoint.

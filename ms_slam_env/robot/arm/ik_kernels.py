@@ -8,7 +8,9 @@ a candidate ``k``.
 
 from __future__ import annotations
 
-from ms_slam_env._runtime.warp import wp
+from typing import Any
+
+from ms_slam_env._runtime.warp import kernel_wp as wp
 
 _ITERATIONS = wp.constant(8)
 _CONVERGED_M = wp.constant(1.0e-4)
@@ -17,8 +19,8 @@ _TOLERANCE_M = wp.constant(1.8e-3)
 _TOLERANCE_RAD = wp.constant(3.14e-3)
 _LARGEST_STEP_RAD = wp.constant(0.3)
 
-vec6 = wp.types.vector(length=6, dtype=wp.float32)
-mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
+vec6: Any = wp.types.vector(length=6, dtype=wp.float32)
+mat66: Any = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
 
 
 @wp.struct
@@ -26,39 +28,39 @@ class Arm:
     """Geometry of a chain with n joints, m capsules and p pairs of capsules."""
 
     num_joints: int
-    joint_R: wp.array(dtype=wp.mat33)  # (n + 1,) each joint in the link before, then the camera
-    joint_t: wp.array(dtype=wp.vec3)  # (n + 1,)
-    lower: wp.array(dtype=float)  # (n,)
-    upper: wp.array(dtype=float)  # (n,)
-    speed: wp.array(dtype=float)  # (n,)
-    capsule_link: wp.array(dtype=int)  # (m,) 0 is the base
-    capsule_a: wp.array(dtype=wp.vec3)  # (m,)
-    capsule_b: wp.array(dtype=wp.vec3)  # (m,)
-    capsule_parts: wp.array(dtype=int)  # (m,) pieces that its axis is cut into
-    capsule_need: wp.array(dtype=float)  # (m,) distance of the axis to furniture
-    capsule_cover: wp.array(dtype=float)  # (m,) the same for the balls that cover it
-    pair: wp.array(dtype=wp.vec2i)  # (p,)
-    pair_need: wp.array(dtype=float)  # (p,) distance of their axes
+    joint_R: wp.array[wp.mat33]  # (n + 1,) each joint in the link before, then the camera
+    joint_t: wp.array[wp.vec3]  # (n + 1,)
+    lower: wp.array[float]  # (n,)
+    upper: wp.array[float]  # (n,)
+    speed: wp.array[float]  # (n,)
+    capsule_link: wp.array[int]  # (m,) 0 is the base
+    capsule_a: wp.array[wp.vec3]  # (m,)
+    capsule_b: wp.array[wp.vec3]  # (m,)
+    capsule_parts: wp.array[int]  # (m,) pieces that its axis is cut into
+    capsule_need: wp.array[float]  # (m,) distance of the axis to furniture
+    capsule_cover: wp.array[float]  # (m,) the same for the balls that cover it
+    pair: wp.array[wp.vec2i]  # (p,)
+    pair_need: wp.array[float]  # (p,) distance of their axes
 
 
 @wp.struct
 class Scratch:
     """Working memory of each candidate."""
 
-    R: wp.array2d(dtype=wp.mat33)  # (k, n + 2) links, then the camera
-    t: wp.array2d(dtype=wp.vec3)
-    q: wp.array3d(dtype=float)  # (k, 1, n) joint angles between two waypoints
-    low: wp.array2d(dtype=float)  # (k, n) limits of the joint angles on this path
-    high: wp.array2d(dtype=float)
-    J: wp.array2d(dtype=vec6)  # (k, n) columns of the geometric Jacobian
-    step: wp.array2d(dtype=float)  # (k, n) of one iteration
-    held: wp.array2d(dtype=int)  # (k, n) 1 for a joint held at its bound
-    a: wp.array2d(dtype=wp.vec3)  # (k, m) ends of the capsules in the base frame
-    b: wp.array2d(dtype=wp.vec3)
+    R: wp.array2d[wp.mat33]  # (k, n + 2) links, then the camera
+    t: wp.array2d[wp.vec3]
+    q: wp.array3d[float]  # (k, 1, n) joint angles between two waypoints
+    low: wp.array2d[float]  # (k, n) limits of the joint angles on this path
+    high: wp.array2d[float]
+    J: wp.array2d[vec6]  # (k, n) columns of the geometric Jacobian
+    step: wp.array2d[float]  # (k, n) of one iteration
+    held: wp.array2d[int]  # (k, n) 1 for a joint held at its bound
+    a: wp.array2d[wp.vec3]  # (k, m) ends of the capsules in the base frame
+    b: wp.array2d[wp.vec3]
 
 
 @wp.func
-def forward(arm: Arm, q: wp.array3d(dtype=float), k: int, w: int, work: Scratch):
+def forward(arm: Arm, q: wp.array3d[float], k: int, w: int, work: Scratch) -> None:
     """Poses of links and camera at waypoint ``w``."""
     R = wp.identity(n=3, dtype=float)
     t = wp.vec3(0.0, 0.0, 0.0)
@@ -87,7 +89,7 @@ def forward(arm: Arm, q: wp.array3d(dtype=float), k: int, w: int, work: Scratch)
 
 
 @wp.func
-def cholesky_solve(M: mat66, e: vec6):
+def cholesky_solve(M: mat66, e: vec6) -> vec6:
     """Solution of M x = e for a symmetric positive definite M."""
     L = mat66(0.0)
     x = vec6(0.0)
@@ -115,7 +117,7 @@ def cholesky_solve(M: mat66, e: vec6):
 
 
 @wp.func
-def place_columns(arm: Arm, k: int, work: Scratch):
+def place_columns(arm: Arm, k: int, work: Scratch) -> None:
     """The Jacobian's columns from the links' poses."""
     t = work.t[k, arm.num_joints + 1]
     for i in range(arm.num_joints):
@@ -126,8 +128,8 @@ def place_columns(arm: Arm, k: int, work: Scratch):
 
 @wp.func
 def bounded_step(
-    arm: Arm, error: vec6, damping: float, q: wp.array3d(dtype=float), k: int, w: int, work: Scratch
-):
+    arm: Arm, error: vec6, damping: float, q: wp.array3d[float], k: int, w: int, work: Scratch
+) -> None:
     """Newton step that stays between ``work.low`` and ``work.high``, in ``work.step``.
 
     Least squares of the pose's error plus ``damping`` times those of the path from the waypoint
@@ -168,11 +170,11 @@ def solve_waypoint(
     R_target: wp.mat33,
     t_target: wp.vec3,
     damping: float,
-    q: wp.array3d(dtype=float),
+    q: wp.array3d[float],
     k: int,
     w: int,
     work: Scratch,
-):
+) -> int:
     """One Newton step or more from the guess in ``q``; whether the camera is within tolerance."""
     n = arm.num_joints
     close = int(0)

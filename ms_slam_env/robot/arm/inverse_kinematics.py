@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ms_slam_env.geometry import Float64
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.clearance import ClearanceField

@@ -12,14 +12,12 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Int32
 from ms_slam_env._runtime.input_files import MAX_MESH_BYTES, MAX_TEXT_BYTES, check_file, read_bytes
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, make_pose
+from ms_slam_env.geometry import make_pose
 from ms_slam_env.robot.arm.chain import Chain, separate_pairs
-
-Int32 = NDArray[np.int32]
 
 ARM_MODELS = {"mico": Path(__file__).with_name("mico.xml")}
 """Arms that come with the package."""

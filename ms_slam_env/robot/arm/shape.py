@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import trimesh
 
-from ms_slam_env.geometry import Float64
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.robot.arm.base_placement import COLUMN_RADIUS_M
 from ms_slam_env.robot.arm.model import ArmModel
 

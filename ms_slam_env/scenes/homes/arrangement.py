@@ -10,7 +10,8 @@ from itertools import product
 import numpy as np
 from scipy import ndimage
 
-from ms_slam_env.scenes.base import Float64, Rng
+from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.room import Opening, Room, Window
 

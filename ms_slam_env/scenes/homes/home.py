@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from ms_slam_env._runtime.arrays import Bool, Float64, Int32
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes import mesh_cache
-from ms_slam_env.scenes.base import Float64, Int32, Rng, TexturedMesh
+from ms_slam_env.scenes.base import Rng, TexturedMesh
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.free_space import FreeSpace
 from ms_slam_env.scenes.homes.arrangement import Furnisher
@@ -236,8 +237,6 @@ def _window_light(own: RoomPlan, room: Room, wall: int, window: Window, sky: Flo
     origin = tuple(np.add(left, (*own.low, 0.0)).tolist())
     return Panel(origin, tuple(right - left), (0, 0, window.height), tuple(sky), (3, 2))
 
-
-Bool = NDArray[np.bool_]
 
 CAMERA_M = 0.15
 """Free space around a camera that goes about."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from ms_slam_env.scenes.base import Float64
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.scenes.free_space import FreeSpace
 
 _CELL_M = 0.1

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.input_files import MAX_MESH_BYTES, read_bytes
 from ms_slam_env.config import Checked, bounded, chosen, from_dict, parse_named
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Float64
 
 if TYPE_CHECKING:
     from ms_slam_env.scenes.mesh_formats.part import MeshFolder, Part

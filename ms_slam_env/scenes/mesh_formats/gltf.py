@@ -15,17 +15,10 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Float64
 from ms_slam_env.scenes.lighting import linear_to_srgb
-from ms_slam_env.scenes.mesh_formats.part import (
-    Image,
-    Int64,
-    MeshFolder,
-    Part,
-    check_size,
-    text_of,
-)
+from ms_slam_env.scenes.mesh_formats.part import Image, MeshFolder, Part, check_size, text_of
 
 _MAGIC, _JSON, _BIN = b"glTF", b"JSON", b"BIN\0"
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

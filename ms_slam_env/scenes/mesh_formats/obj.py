@@ -7,12 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env._runtime.input_files import MAX_TEXT_BYTES
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Float64
 from ms_slam_env.scenes.mesh_formats.part import (
     Image,
-    Int64,
     MeshFolder,
     MissingFileError,
     Part,

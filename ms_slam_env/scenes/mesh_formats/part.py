@@ -12,13 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Image, Int64
 from ms_slam_env._runtime.input_files import MAX_IMAGE_BYTES, MAX_MESH_BYTES, read_bytes
 from ms_slam_env.camera.image_files import decode_texture
 from ms_slam_env.errors import InputError, InputWarning
-from ms_slam_env.scenes.base import Float64
-
-Int64 = NDArray[np.int64]
-Image = NDArray[np.uint8]
 
 MAX_TRIANGLES = 10_000_000
 """Of a mesh file: some 4 GB of memory."""

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Float64
 from ms_slam_env.scenes.mesh_formats.part import (
-    Int64,
     MeshFolder,
     Part,
     Polygons,

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ms_slam_env.scenes.base import Float32, Float64, Rng, TexturedMesh
+from ms_slam_env._runtime.arrays import Float32, Float64
+from ms_slam_env.scenes.base import Rng, TexturedMesh
 from ms_slam_env.scenes.builder import Geometry, MeshBuilder
 from ms_slam_env.scenes.lighting import hemispheres
 from ms_slam_env.scenes.mesh_queries import RayCaster

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Float64
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 
 KERB_M = 0.12

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
+from ms_slam_env._runtime.arrays import Image
 from ms_slam_env.scenes.base import Rng
 
 Field = NDArray[np.float32]
-Image = NDArray[np.uint8]
 
 _VARIANTS = 3
 _CLIP = 3.0

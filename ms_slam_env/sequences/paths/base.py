@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env.geometry import Float64, look_at, relative_angle
+from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env.geometry import look_at, relative_angle
 from ms_slam_env.scenes.base import Scene
 
 _SAMPLES_PER_HOP = 40

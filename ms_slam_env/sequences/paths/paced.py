@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.geometry import Float64
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sequences.paths.base import CameraPath, hand_tremor, resample
 from ms_slam_env.sequences.paths.handheld import HandheldPath

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, check_pose, make_pose, so3_exp
+from ms_slam_env.geometry import check_pose, make_pose, so3_exp
 from ms_slam_env.scenes.base import Scene
 
 SCALES = tuple(round(1.0 - 0.05 * k, 2) for k in range(19))

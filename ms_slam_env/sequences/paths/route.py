@@ -7,9 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.geometry import Float64, look_at
+from ms_slam_env.geometry import look_at
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sequences.paths.base import CameraPath, frame_times, hand_tremor, resample, unit
 from ms_slam_env.sequences.paths.wandering import RADIUS_M
@@ -18,6 +19,9 @@ _SAMPLE_M = 0.1
 _CORNER_M = 0.9  # width of the filter that rounds corners
 _AHEAD_M = 2.5  # the camera looks at where it will be
 _OF_PASSAGE = (0.25, 1.2, 0.06)  # the most of these two, and of straying, per width of a passage
+_DOWN_DEG = 6.0  # mean angle of the view below the horizon, of somebody who looks where he goes
+_SWAY_DEG = 8.0  # how far the view swings to the sides
+_STRAY_M = 0.25  # how far the way strays to the sides: a second pass is not the first again
 _WAVES_M = (5.3, 11.9, 27.1)  # lengths of the sway along the way
 _PACE_PERIODS = (23.0, 51.0, 117.0)  # in frames
 _ATTEMPTS = 20
@@ -40,9 +44,6 @@ class RoutePath(Checked, CameraPath):
         turn_deg_s: mean speed of rotation where it turns.
         variation: the pace varies by this share, up and down.
         height_m: of the camera above the ground.
-        down_deg: mean angle of the view below the horizon.
-        sway_deg: how far the view swings to the sides.
-        stray_m: how far the way strays to the sides.
 
     Raises:
         InputError: a value out of range, or fewer than two places.
@@ -54,9 +55,6 @@ class RoutePath(Checked, CameraPath):
     turn_deg_s: float = bounded(25.0, 1e-2, 1e5)
     variation: float = bounded(0.2, 0.0, 0.9)
     height_m: float = bounded(1.6, 0.3, 3.0)
-    down_deg: float = bounded(6.0, -60.0, 60.0)
-    sway_deg: float = bounded(8.0, 0.0, 60.0)
-    stray_m: float = bounded(0.25, 0.0, 2.0)
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
@@ -87,7 +85,7 @@ class RoutePath(Checked, CameraPath):
 
     def _dense(self, corners: Float64, passage_m: float, rng: np.random.Generator) -> Float64:
         """Poses (M, 4, 4) every ``_SAMPLE_M``, speeds left aside."""
-        most = (_CORNER_M, _AHEAD_M, self.stray_m)
+        most = (_CORNER_M, _AHEAD_M, _STRAY_M)
         corner_m, ahead_m, stray_m = map(min, most, np.multiply(_OF_PASSAGE, passage_m).tolist())
         line = _rounded(corners, corner_m)
         arc: Float64 = _SAMPLE_M * np.arange(len(line), dtype=np.float64)
@@ -99,8 +97,8 @@ class RoutePath(Checked, CameraPath):
         side = np.stack([-forward[:, 1], forward[:, 0], np.zeros(len(line))], -1)
         eyes = line + stray_m * _wave(arc, rng)[:, None] * side
         eyes[:, 2] += self.height_m + 0.05 * _wave(arc, rng)
-        yaw = np.radians(self.sway_deg) * _wave(arc, rng)
-        pitch = np.radians(-self.down_deg + 2.0 * _wave(arc, rng))
+        yaw = np.radians(_SWAY_DEG) * _wave(arc, rng)
+        pitch = np.radians(-_DOWN_DEG + 2.0 * _wave(arc, rng))
         aims = np.cos(yaw)[:, None] * forward + np.sin(yaw)[:, None] * side
         aims = np.cos(pitch)[:, None] * aims + np.sin(pitch)[:, None] * np.array([0.0, 0.0, 1.0])
         return np.stack([look_at(eye, eye + aim) for eye, aim in zip(eyes, aims, strict=True)])

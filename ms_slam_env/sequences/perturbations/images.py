@@ -15,6 +15,7 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.sequences.perturbations.base import ImagePerturbation, Moment, random_numbers
 
 _ATTEMPTS = 10_000
+_EDGE_JUMP = 0.05  # of a depth edge: neighbours differ by more than this share of the nearer one
 
 
 _NATIVE_WIDTH = 640
@@ -28,7 +29,6 @@ class DepthDropout(Checked, ImagePerturbation):
         patches: share of the image that elliptic patches cover, at least; 0 = none.
         patch_size: mean diameter of a patch as a share of the image's width.
         edge_px: pixels on either side of a depth edge that have no reading; 0 = none.
-        edge_jump: depth edge: neighbours differ by more than this share of the nearer one.
         pixels: probability that a single pixel has no reading.
         seed: of the holes, beside the sequence's.
     """
@@ -36,7 +36,6 @@ class DepthDropout(Checked, ImagePerturbation):
     patches: float = bounded(0.1, 0.0, 0.95)
     patch_size: float = bounded(0.1, 0.005, 1.0)
     edge_px: int = bounded(1, 0, 1000)
-    edge_jump: float = bounded(0.05, 1e-4, 1e3)
     pixels: float = bounded(0.01, 0.0, 1.0)
     seed: int = bounded(0, 0, 2**32)
 
@@ -68,7 +67,7 @@ class DepthDropout(Checked, ImagePerturbation):
             for turn in (1, -1):
                 other = np.roll(depth, turn, axis)
                 nearer = np.minimum(depth, other)
-                jumps = (nearer > 0) & (np.abs(depth - other) > nearer * self.edge_jump)
+                jumps = (nearer > 0) & (np.abs(depth - other) > nearer * _EDGE_JUMP)
                 jumps[(slice(None),) * axis + (0 if turn == 1 else -1,)] = False  # rolled around
                 edges |= jumps
         return edges
@@ -202,19 +201,17 @@ class ExposureJumps(Checked, GainAndBias):
 
 @dataclass(frozen=True)
 class BlackFrames(Checked, ImagePerturbation):
-    """Runs of frames without colour, and without depth unless told otherwise.
+    """Runs of frames without colour and without depth.
 
     Attributes:
         start: first black frame (index on the trajectory).
         length: frames in a row; 0 = off.
         every: frames from the start of one run to the start of the next; 0 = one run only.
-        keep_depth: whether depth is still read, as when the light goes out.
     """
 
     start: int = bounded(60, 0, 10_000_000)
     length: int = bounded(10, 0, 10_000_000)
     every: int = bounded(0, 0, 10_000_000)
-    keep_depth: bool = False
 
     def is_black(self, index: int) -> bool:
         """Whether the frame of this index is black."""
@@ -227,5 +224,6 @@ class BlackFrames(Checked, ImagePerturbation):
         """See the base class."""
         if not self.is_black(moment.index):
             return frame
-        depth = frame.depth if self.keep_depth else np.zeros_like(frame.depth)
-        return dataclasses.replace(frame, color=np.zeros_like(frame.color), depth=depth)
+        return dataclasses.replace(
+            frame, color=np.zeros_like(frame.color), depth=np.zeros_like(frame.depth)
+        )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
-from ms_slam_env.geometry import Float64
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import LightProbe
 from ms_slam_env.scenes.movers import Joint, Shape

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env.camera import Distortion
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.geometry import Float64, make_pose
+from ms_slam_env.geometry import make_pose
 from ms_slam_env.sensor import NoiseConfig
 from ms_slam_env.sequences.perturbations.base import (
     FrameSelection,
-    Int64,
     MotionPerturbation,
     OpticalPerturbation,
     Optics,

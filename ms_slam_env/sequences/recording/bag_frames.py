@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.camera.registration import ColorCamera
 from ms_slam_env.errors import InputError, InputWarning
-from ms_slam_env.geometry import Float64, check_pose, invert, pose_from_quaternion
+from ms_slam_env.geometry import check_pose, invert, pose_from_quaternion
 
 _SAME_M = 1e-3  # cameras that stand as near, or are turned by as many radians, are one
 _SAME_PX = 0.5

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float32
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.camera.image_files import check_size, decode_color, decode_depth
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.sequences.recording.recording import SATURATED
-
-Float32 = NDArray[np.float32]
 
 # Encoding to channels, and which of them are red, green and blue.
 _COLORS = {

@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.input_files import check_file, is_named
 from ms_slam_env.camera import Distortion, Intrinsics
 from ms_slam_env.camera.distortion import NO_DISTORTION
 from ms_slam_env.errors import InputError, InputWarning, unknown
-from ms_slam_env.geometry import Float64, check_pose, pose_from_quaternion
+from ms_slam_env.geometry import check_pose, pose_from_quaternion
 from ms_slam_env.sequences.recording.bag_frames import (
     Transforms,
     poses_of_camera,

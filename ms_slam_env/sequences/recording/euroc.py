@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.input_files import is_named, read_text
 from ms_slam_env.camera import Distortion, Intrinsics
 from ms_slam_env.config import load_yaml
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, check_pose, invert, make_pose, pose_from_quaternion
+from ms_slam_env.geometry import check_pose, invert, make_pose, pose_from_quaternion
 from ms_slam_env.sequences.recording.listings import Calibration, number, rigid, rows
 from ms_slam_env.sequences.recording.recording import Recording
 from ms_slam_env.sequences.recording.stereo import StereoEntry, StereoRig

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.input_files import is_named
 from ms_slam_env.camera.image_files import SUFFIXES
 from ms_slam_env.errors import InputError, InputWarning
-from ms_slam_env.geometry import Float64
 from ms_slam_env.sequences.recording.listings import listed_times
 from ms_slam_env.sequences.recording.recording import Entry
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, UNITS, say_unit, unit_of

@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.input_files import read_text, words_of
 from ms_slam_env.camera import Distortion, Intrinsics
 from ms_slam_env.camera.distortion import ALIASES, NAMES
 from ms_slam_env.camera.image_files import image_size
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, check_pose
+from ms_slam_env.geometry import check_pose
 from ms_slam_env.sequences.trajectory import in_seconds, said_unit, say_unit, unit_of
 
 _ROUNDED = 1e-2  # as for the length of a quaternion

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64
 from ms_slam_env.sequences.recording.bags import is_bag
 from ms_slam_env.sequences.recording.recording import Entry, Recording
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, parse_image_size
 from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.camera.image_files import read_color, read_depth
@@ -17,7 +18,6 @@ from ms_slam_env.camera.image_size import Crop
 from ms_slam_env.camera.registration import ColorCamera, Registration
 from ms_slam_env.camera.undistortion import undistort_color, undistort_depth
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64
 from ms_slam_env.sequences.sequence import Frames, Sequence
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate
 

@@ -17,11 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.input_files import is_named
 from ms_slam_env.camera import Intrinsics, intensity_image
 from ms_slam_env.camera.image_files import image_size, read_grey
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import Float64, check_pose, make_pose
+from ms_slam_env.geometry import check_pose, make_pose
 from ms_slam_env.sequences.recording.image_folders import images
 from ms_slam_env.sequences.recording.listings import (
     Calibration,

@@ -13,12 +13,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import RGBDFrame, check_frame
 from ms_slam_env.geometry import check_pose, invert, se3_exp, se3_log
 from ms_slam_env.slam.shared.state import Saved, Stateful, check_has
 from ms_slam_env.slam.shared.state_check import ArrayOf, Fields, OrNone, WholeNumber
 from ms_slam_env.slam.shared.submap_frames import Submaps
-from ms_slam_env.slam.slam_backend import BorrowedMap, Float64, SlamBackend, TrackResult
+from ms_slam_env.slam.slam_backend import BorrowedMap, SlamBackend, TrackResult
 
 
 class FrameFilter(Stateful):

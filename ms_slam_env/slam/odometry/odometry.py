@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
@@ -23,7 +24,7 @@ from ms_slam_env.slam.shared.alignment_check import NO_ALIGNMENT, AcceptanceThre
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, check_alignment
 from ms_slam_env.slam.shared.state_check import ArrayOf, OrNone
 from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam, motion_hypotheses
-from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M, BorrowedMap, Float64
+from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M, BorrowedMap
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
 _TOO_LITTLE_IN_VIEW = "too little of the map is in view"

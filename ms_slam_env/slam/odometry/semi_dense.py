@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.camera.frame import reduce_depth
-from ms_slam_env.geometry import Float64, invert, se3_exp
+from ms_slam_env.geometry import invert, se3_exp
 from ms_slam_env.slam.shared.alignment_measures import DepthImage
-from ms_slam_env.slam.slam_backend import Float32
 
 ITERATIONS = (8, 12, 20)  # at most, finest level first
 _GRADIENT = 5.0  # grey levels a pixel, from which on a pixel is a point, as in LSD-SLAM

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import relative_angle
 from ms_slam_env.slam.shared.alignment_check import (
@@ -17,7 +18,6 @@ from ms_slam_env.slam.shared.alignment_check import (
     AlignmentStatistics,
     evaluate_alignment,
 )
-from ms_slam_env.slam.slam_backend import Float32, Float64
 
 _PHOTOMETRIC_LEVELS = 20.0  # largest difference of grey values once their median is taken away
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ms_slam_env._runtime.arrays import Float32, Float64, Int64
 from ms_slam_env.slam.shared.alignment_measures import DepthImage
-from ms_slam_env.slam.slam_backend import Float32, Float64
 
-Int64 = NDArray[np.int64]
 Descriptors = NDArray[np.uint64]
 
 _NEIGHBOURS = 8  # features compared with a projected point at most

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.shared.feature_matching import match_anywhere
 from ms_slam_env.slam.shared.orb_features import FeatureExtractor, Features, InverseDepth
 from ms_slam_env.slam.shared.point_poses import Sightings, pose_from_matches, refine_pose
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import ListOf, WholeNumber
-from ms_slam_env.slam.slam_backend import Float32, Float64
 
 _HAMMING = 60  # largest distance of matching descriptors, bits of 256
 _ERROR_PX = 2.5  # of a match that RANSAC counts

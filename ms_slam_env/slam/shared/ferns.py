@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64, UInt8
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
@@ -53,9 +54,6 @@ class FernConfig(Checked):
                 f"FernConfig.near_m = {self.near_m} must be below far_m = {self.far_m}"
             )
 
-
-UInt8 = NDArray[np.uint8]
-Float64 = NDArray[np.float64]
 
 COLOUR_BITS = 7  # red 1, green 2, blue 4
 DEPTH_BIT = 8

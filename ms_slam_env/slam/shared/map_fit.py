@@ -9,11 +9,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.shared.alignment_measures import measure_photometric_consistency
-from ms_slam_env.slam.slam_backend import Float64, Views
+from ms_slam_env.slam.slam_backend import Views
 
 _LOOKS_AT = 0.2  # share of a frame that the other map must show for the frame to be compared
 _FAR_M = 10.0

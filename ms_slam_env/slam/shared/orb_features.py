@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.shared.rows import Rows
-from ms_slam_env.slam.slam_backend import Float32, Float64
 
 SCALE = 1.2  # between levels of the pyramid, as in ORB-SLAM
 _EDGE_PX = 8  # of the magnified image; ORB itself continues the image by reflection

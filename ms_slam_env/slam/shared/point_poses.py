@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, make_pose, orthonormal, transform_points
 from ms_slam_env.slam.shared.rows import Rows
-from ms_slam_env.slam.slam_backend import Float64
 
 # 95 % quantiles of the chi-squared distribution with two and three degrees of freedom.
 CHI2_PIXEL, CHI2_PIXEL_AND_DEPTH = 5.991, 7.815

@@ -13,14 +13,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Int32
 from ms_slam_env.geometry import adjoint, invert, se3_exp, se3_log
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import ListOf, WholeNumber
-
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
 
 
 @dataclass(frozen=True)

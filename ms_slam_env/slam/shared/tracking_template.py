@@ -10,6 +10,7 @@ from typing import ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, check_frame
 from ms_slam_env.geometry import check_pose, invert, make_pose, orthonormal, so3_exp
 from ms_slam_env.slam.shared.alignment_check import (
@@ -21,7 +22,7 @@ from ms_slam_env.slam.shared.alignment_check import (
 )
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, overlay
 from ms_slam_env.slam.shared.state import Saved
-from ms_slam_env.slam.slam_backend import Float64, SlamBackend, TrackResult
+from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
 
 TURN_RAD = np.radians(10.0)
 STEP_M = 0.1

@@ -8,17 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, orthonormal
-from ms_slam_env.slam.shared.feature_matching import Int64
 from ms_slam_env.slam.shared.point_poses import (
     CHI2_PIXEL,
     CHI2_PIXEL_AND_DEPTH,
     Sightings,
     residuals,
 )
-from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.sparse.sparse_config import INVERSE_DEPTH_NOISE, PIXEL_NOISE
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 

@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.shared.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, check_alignment
-from ms_slam_env.slam.shared.feature_matching import Int64, match_anywhere, match_near
+from ms_slam_env.slam.shared.feature_matching import match_anywhere, match_near
 from ms_slam_env.slam.shared.orb_features import Features, InverseDepth
 from ms_slam_env.slam.shared.point_poses import Sightings, pose_from_matches, refine_pose
 from ms_slam_env.slam.shared.rows import join
 from ms_slam_env.slam.shared.tracking_template import Attempt
-from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.sparse.patches import Patches, Templates, find_patches
 from ms_slam_env.slam.sparse.sparse_config import (
     HAMMING,

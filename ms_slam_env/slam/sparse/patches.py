@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.shared.rows import Rows
-from ms_slam_env.slam.slam_backend import Float32, Float64
 
 _HALF = 3  # pixels on each side of the patch's centre
 _MARGIN = 6.0  # pixels to the border

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.geometry import invert, orthonormal, relative_angle
 from ms_slam_env.slam.shared.feature_matching import most_alike
 from ms_slam_env.slam.shared.state import Stateful
 from ms_slam_env.slam.shared.state_check import ArrayOf
-from ms_slam_env.slam.slam_backend import Float64, Loop
+from ms_slam_env.slam.slam_backend import Loop
 from ms_slam_env.slam.sparse.local_mapping import load_gtsam
 from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer
 from ms_slam_env.slam.sparse.sparse_map import SparseMap

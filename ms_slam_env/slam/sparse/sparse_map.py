@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from ms_slam_env._runtime.arrays import Float32, Float64, Int64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.shared.alignment_measures import DepthImage
-from ms_slam_env.slam.shared.feature_matching import Int64, thumbnail
+from ms_slam_env.slam.shared.feature_matching import thumbnail
 from ms_slam_env.slam.shared.orb_features import Features, InverseDepth
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import ArrayOf, Fields, ListOf, WholeNumber
-from ms_slam_env.slam.slam_backend import Float32, Float64
 from ms_slam_env.slam.sparse.patches import Templates, cut
 
 _TRIED_FRAMES = 8  # frames after which a point that is hardly ever found again is dropped

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.geometry import relative_angle
 from ms_slam_env.slam.shared.alignment_measures import DepthImage
@@ -23,7 +24,7 @@ from ms_slam_env.slam.shared.orb_features import FeatureExtractor, InverseDepth
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import Fields, ListOf, WholeNumber
 from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam
-from ms_slam_env.slam.slam_backend import BorrowedMap, Float64, Loop, TrackResult
+from ms_slam_env.slam.slam_backend import BorrowedMap, Loop, TrackResult
 from ms_slam_env.slam.sparse.local_mapping import adjust_around, load_gtsam
 from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer, keyframe_features
 from ms_slam_env.slam.sparse.pose_graph import LoopCloser

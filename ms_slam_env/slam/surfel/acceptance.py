@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.shared.alignment_check import (
@@ -20,7 +21,6 @@ from ms_slam_env.slam.shared.alignment_check import (
     evaluate_alignment,
     evaluate_on_device,
 )
-from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.normal_equations import Hypotheses, Sum
 from ms_slam_env.slam.surfel.solver import (
     cholesky,

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import differential_evolution, minimize
 
+from ms_slam_env._runtime.arrays import Float32, Float64, UInt8
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.camera.registration import Registration
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import ArrayOf, ListOf
-from ms_slam_env.slam.slam_backend import Float32, Float64, TrackResult
+from ms_slam_env.slam.slam_backend import TrackResult
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 
 FEWEST_EDGES = 500  # points on depth steps that the offset is estimated from
@@ -112,8 +113,6 @@ def _steepness(
         ).sum()
     return total / sum(map(len, places))
 
-
-UInt8 = NDArray[np.uint8]
 
 ENOUGH_EDGES = 6000  # points on depth steps, or
 MOST_FRAMES = 60  # frames after which the offset of the cameras is estimated

@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Bool, Float32, Float64
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.shared.state import Saved
-from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache, fetch, put
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame, Pieces
 from ms_slam_env.slam.surfel.rendering import ModelView
@@ -281,10 +281,6 @@ def enlarge(masked: wp.array[wp.int32], grid: Grid, image: wp.array[wp.int32]) -
             put(image, live_row + u, value)
             u += 1
         column += 1
-
-
-Bool = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
 
 
 class MotionMask(Saved):

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Bool, Float64, Int32
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.shared.alignment_check import (
     AlignmentStatistics,
@@ -17,7 +18,6 @@ from ms_slam_env.slam.shared.alignment_measures import measure_photometric_consi
 from ms_slam_env.slam.shared.feature_poses import KeyframeImages, pose_from_features
 from ms_slam_env.slam.shared.ferns import Candidate, FernConfig, FernDatabase, dissimilarities
 from ms_slam_env.slam.shared.state import Saved
-from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
 from ms_slam_env.slam.surfel.pose_hypotheses import (
     KEYFRAME_HYPOTHESES,
@@ -28,9 +28,6 @@ from ms_slam_env.slam.surfel.pose_hypotheses import (
 )
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.surfel_config import AcceptanceConfig, SurfelConfig
-
-Bool = NDArray[np.bool_]
-Int32 = NDArray[np.int32]
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, se3_log
@@ -22,7 +23,6 @@ from ms_slam_env.slam.shared.alignment_check import (
 )
 from ms_slam_env.slam.shared.feature_poses import FeaturePose, LastFrames
 from ms_slam_env.slam.shared.state import Stateful, check_has
-from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.acceptance import (
     Alignment,
     accept_any_fit,

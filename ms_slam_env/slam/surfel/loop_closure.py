@@ -22,8 +22,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Bool, Float64, Int32
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.shared.alignment_check import TrackingStatus
@@ -46,11 +46,6 @@ from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 from ms_slam_env.slam.surfel.surfels import EARLIEST, any_time
 from ms_slam_env.slam.surfel.tracker import Tracker, model_stride
 from ms_slam_env.slam.surfel.trajectory_history import TrajectoryHistory, motion_size
-
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
-Bool = NDArray[np.bool_]
-
 
 SimilarViews = Callable[[int, int], list[Candidate]]
 """Keyframes of an env, taken before a frame, that resemble the one just tracked, best first."""

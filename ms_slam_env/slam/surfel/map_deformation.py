@@ -35,11 +35,11 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.shared.rows import Rows, join
-from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.rendering import SplatRenderer
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
@@ -52,7 +52,6 @@ from ms_slam_env.slam.surfel.surfels import (
     floor_int,
 )
 
-Int64 = NDArray[np.int64]
 NEIGHBOURS = 4  # k: of a node, and nodes that influence a point
 TEMPORAL_WINDOW = 20  # nodes nearest in time among which a point's nearest ones are looked for
 FEWEST_NODES = NEIGHBOURS + 2

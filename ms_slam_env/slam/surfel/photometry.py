@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Bool
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.shared.state import Saved
@@ -25,8 +26,6 @@ from ms_slam_env.slam.surfel.device import (
 )
 from ms_slam_env.slam.surfel.normal_equations import Photometry
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
-
-Bool = NDArray[np.bool_]
 
 DTYPE: np.dtype[Any] = Photometry.numpy_dtype()  # type: ignore[attr-defined]
 SMALL_GAIN = 0.04  # a gain and a bias this near to none are left alone: a systematic error of

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, make_pose, relative_angle, se3_exp, se3_log, so3_exp
-from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Hypotheses, Sum
 
 NUM_HYPOTHESES = 8

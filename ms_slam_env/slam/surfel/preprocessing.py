@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Bool, Float32
 from ms_slam_env._runtime.warp import RecordedLaunch
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
@@ -496,8 +497,6 @@ class Pyramid:
         return batch * height, -(-width // self._columns)
 
 
-Bool = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
 _FROM = {0: np.s_[:-1, :], 1: np.s_[:, :-1]}  # pixels with a neighbour below, or to the right
 _TO = {0: np.s_[1:, :], 1: np.s_[:, 1:]}
 

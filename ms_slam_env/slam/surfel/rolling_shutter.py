@@ -21,13 +21,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import RecordedLaunch
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import se3_log
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.shared.state import Saved
-from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.preprocessing import check_images

@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.shared.alignment_check import MAP_REASONS, TrackingStatus
 from ms_slam_env.slam.shared.ferns import Candidate
 from ms_slam_env.slam.shared.state import Saved, check_has
-from ms_slam_env.slam.slam_backend import Float64, TrackResult
+from ms_slam_env.slam.slam_backend import TrackResult
 from ms_slam_env.slam.surfel.acceptance import Alignment, with_doubt
 from ms_slam_env.slam.surfel.device import HostDeviceBuffer
 from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask

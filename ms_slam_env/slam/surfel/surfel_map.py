@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import RecordedLaunch
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.shared.state import Stateful
 from ms_slam_env.slam.shared.state_check import ArrayOf, Fields
-from ms_slam_env.slam.slam_backend import Float64, Views
+from ms_slam_env.slam.slam_backend import Views
 from ms_slam_env.slam.surfel.device import fetch, put
 from ms_slam_env.slam.surfel.frustum_culling import (
     FrustumCuller,

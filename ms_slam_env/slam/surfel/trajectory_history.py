@@ -9,15 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ms_slam_env._runtime.arrays import Float64, Int32
 from ms_slam_env.geometry import invert, relative_angle, transform_points
 from ms_slam_env.slam.shared.rows import join
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import ArrayOf, ListOf, OrNone, WholeNumber
-from ms_slam_env.slam.slam_backend import Float64, Loop
+from ms_slam_env.slam.slam_backend import Loop
 from ms_slam_env.slam.surfel.map_deformation import Constraints, Deformation, no_constraints
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
-
-Int32 = NDArray[np.int32]
 
 ANCHORS = 12  # points of the map that hold a frame's pose
 KEPT_CONSTRAINTS = 1000  # relative ones, of the newest loops

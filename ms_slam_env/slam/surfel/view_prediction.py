@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
-from ms_slam_env.slam.slam_backend import Float64
 from ms_slam_env.slam.surfel.rendering import (
     ModelView,
     SplatParameters,

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import bounded
 from ms_slam_env.errors import unknown
 from ms_slam_env.geometry import invert, relative_angle, se3_exp, se3_log, transform_points
@@ -27,8 +27,6 @@ from ms_slam_env.slam.team.relative_map_poses import (
     hypotheses_from_features,
     hypotheses_from_relocalisation,
 )
-
-Float64 = NDArray[np.float64]
 
 AGREE_M, AGREE_DEG = 0.10, 5.0  # guesses agree that put robot b's cameras less than this apart
 LEAST_AGREEING, LEAST_SHARE = 3, 0.6  # guesses that must agree, and their share of all

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, make_pose, transform_points
@@ -22,8 +23,6 @@ from ms_slam_env.geometry.point_clouds import umeyama
 from ms_slam_env.slam.shared.map_fit import query_frames
 from ms_slam_env.slam.shared.orb_features import InverseDepth
 from ms_slam_env.slam.slam_backend import SlamBackend
-
-Float64 = NDArray[np.float64]
 
 FEATURES, RELOCALISATION = "features", "relocalisation"
 SOURCES = (FEATURES, RELOCALISATION)

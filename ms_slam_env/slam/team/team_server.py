@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.geometry import invert, relative_angle, se3_exp, se3_log, transform_points
@@ -25,9 +25,6 @@ from ms_slam_env.slam.shared.map_fit import query_frames
 from ms_slam_env.slam.slam_backend import SlamBackend
 from ms_slam_env.slam.sparse.pose_graph import Edge, optimise_poses
 from ms_slam_env.slam.team.relative_map_poses import RobotRun
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 AGREE_M, AGREE_DEG = 0.2, 5.0
 """A keyframe found in another map farther than this from where the merged maps put it is left out.

@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.config import Checked, bounded, check_counts
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.shared.alignment_measures import DepthImage
 from ms_slam_env.slam.shared.tracking_template import Attempt
-from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M, Float64
+from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M
 from ms_slam_env.slam.volumetric.projective_icp import (
     ProjectiveICP,
     Surface,

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.camera.frame import reduce_depth
-from ms_slam_env.geometry import Float64, se3_exp
-from ms_slam_env.slam.slam_backend import Float32
+from ms_slam_env.geometry import se3_exp
 from ms_slam_env.slam.volumetric.voxel_grid import CastView, smooth_depth
 
 _SMOOTHING_M = 0.1  # of the bilateral filter of depth, as SLAMBench has it

@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.odometry.odometry import Aligner
 from ms_slam_env.slam.shared.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, check_alignment
 from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam, motion_hypotheses
-from ms_slam_env.slam.slam_backend import Float64, Views, check_views
+from ms_slam_env.slam.slam_backend import Views, check_views
 from ms_slam_env.slam.volumetric.voxel_grid import (
     DEPTH_SCALE,
     CastView,

@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.shared.state import Stateful
 from ms_slam_env.slam.shared.state_check import ArrayOf
-from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M, Float32, Float64
+from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M
 
 STOCK: dict[str, Any] = {
     "voxel_m": 0.01,
