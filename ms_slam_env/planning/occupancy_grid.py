@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.planning.kernels import BLANK, PASSED, STRUCK, count_states, mark_rays
-from ms_slam_env.slam.base import SlamBackend
 from ms_slam_env.slam.submaps import Submaps
 
 Float64 = NDArray[np.float64]
@@ -169,6 +168,20 @@ class _Carved(NamedTuple):
     T_world_camera: Float64
 
 
+class HasCorrections(Protocol):
+    """Who knows where SLAM has its frames now: SLAM, or what a robot sees of it."""
+
+    @property
+    def frames_counted(self) -> int:
+        """See ``SlamBackend``."""
+
+    def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
+        """See ``SlamBackend``."""
+
+    def submaps(self) -> Submaps:
+        """See ``SlamBackend``."""
+
+
 class OccupancyMap:
     """Keeps the frames that it was carved from, and carves anew what SLAM has moved.
 
@@ -188,7 +201,7 @@ class OccupancyMap:
 
     def add(
         self,
-        slam: SlamBackend,
+        slam: HasCorrections,
         depth: NDArray[np.float32],
         T_world_camera: Float64,
         intrinsics: Intrinsics,
@@ -207,7 +220,7 @@ class OccupancyMap:
                 self.grid.integrate(frame.depth, frame.T_world_camera, intrinsics)
         self._in_grid = present
 
-    def _follow(self, slam: SlamBackend) -> bool:
+    def _follow(self, slam: HasCorrections) -> bool:
         """Put the frames where SLAM has them now; whether one in the grid has moved by that."""
         numbers, poses = slam.corrected_trajectory()
         now = dict(zip(numbers.tolist(), poses, strict=True))
