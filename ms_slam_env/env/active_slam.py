@@ -161,7 +161,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self._observation = make_observation(
             config.observation, self.intrinsics, num_motions, self._actions.num_configurations
         )
-        self.simulation.carves = self._observation.needs_occupancy
+        self.simulation.carves |= self._observation.needs_occupancy
         self._episodes_left = 0  # in the scene that was drawn last
         self.action_space = self._actions.space
         self.observation_space = self._observation.space
@@ -268,7 +268,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
                     inlier_fraction=episode.inlier_fraction,
                     lost_share=min(1.0, self._lost_share()),
                     motion=episode.action,
-                    motion_mask=self.embodiment.action_masks(),
+                    motion_mask=self.simulation.action_masks(),
                     configuration=self._actions.configuration,
                     lookahead=lambda: self.lookahead() / maxima,
                     here=episode.T_world_camera_estimate,
@@ -368,7 +368,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         (n + K,) where the agent chooses the SLAM configuration too.
         """
         _ = self.episode  # none yet: say so
-        return self._actions.masks(self.embodiment.action_masks())
+        return self._actions.masks(self.simulation.action_masks())
 
     def candidate_poses(self) -> Float64:
         """(n, 4, 4) where each motion would bring the camera, by SLAM's estimate of now."""

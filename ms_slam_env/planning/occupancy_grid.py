@@ -7,6 +7,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
@@ -18,6 +19,9 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+
+FAR_M = 0.5
+"""Beyond this a grid does not say how far away the next surface is."""
 
 _CHANGE = np.array([0, -1, 3, 0], dtype=np.int8)  # of the log-odds, by mark
 _LIMIT = 9  # of the log-odds: what was wrong for long is unlearned in as many frames
@@ -65,6 +69,20 @@ class OccupancyGrid:
         value = self.log_odds[tuple(cells[inside].T)]
         states[inside] = np.where(value > 0, OCCUPIED, np.where(value < 0, FREE, UNKNOWN))
         return states
+
+    def clearance(self, points: Float64) -> Float64:
+        """Distance (N,) from points (N, 3) to the middle of the nearest occupied cell, metres.
+
+        At most `FAR_M`. What is unknown is in nobody's way.
+        """
+        far = np.full(len(points), FAR_M)
+        low, high = self.cells_of(np.stack([points.min(0) - FAR_M, points.max(0) + FAR_M]))
+        low, high = np.clip([low, high + 1], 0, self.log_odds.shape)
+        occupied = np.argwhere(self.log_odds[tuple(map(slice, low, high))] > 0)
+        if not len(occupied):
+            return far
+        near, _ = cKDTree(self.centres_of(occupied + low)).query(points, distance_upper_bound=FAR_M)
+        return np.asarray(np.minimum(near, far))
 
     def integrate(
         self, depth: NDArray[np.float32], T_world_camera: Float64, intrinsics: Intrinsics
