@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env import slam as slam_backends
+from ms_slam_env._runtime.extension import load_reference
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.env.actions import ActionDecoder, MotionActions, MotionAndConfigurationActions
 from ms_slam_env.env.camera_feed import CameraFeed, make_camera_feed
@@ -19,7 +20,6 @@ from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.env.observations import CONFIGURATION, make_observation
-from ms_slam_env.env.rendering import draw_moment
 from ms_slam_env.env.reward import Outcome, reward_terms
 from ms_slam_env.env.robot_knowledge import STATE_NAMES, RobotKnowledge
 from ms_slam_env.env.saved_state import load_state, save_state
@@ -35,6 +35,13 @@ from ms_slam_env.sequences.perturbations.base import Perturbation
 from ms_slam_env.slam.base import SlamBackend, Views
 
 Float64 = NDArray[np.float64]
+
+
+VIEWS = {
+    "rgb_array": "ms_slam_env.env.rendering:draw_moment",
+    "human": "ms_slam_env.env.rerun_view:EpisodeView",
+}
+"""Name of the option ``render_mode`` to what shows an episode then, imported where it is chosen."""
 
 
 class ActiveSlamEnv(gymnasium.Env[Any, Any]):
@@ -119,7 +126,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     """
 
     metadata = {  # noqa: RUF012 -- Gymnasium declares it as an instance variable
-        "render_modes": ["rgb_array", "human"],
+        "render_modes": [*VIEWS],
         "render_fps": 10,
     }
 
@@ -251,9 +258,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         """One picture that explains the moment, (480, 1120, 3) uint8; None in other modes."""
         if self.render_mode != "rgb_array":
             return None
-        return draw_moment(
-            self.episode, self.config.targets, self.slam, self.embodiment, self.scene
-        )
+        shown = self.config.targets, self.slam, self.embodiment, self.scene
+        picture: NDArray[np.uint8] = load_reference(VIEWS["rgb_array"])(self.episode, *shown)
+        return picture
 
     def _observe(self) -> Any:
         """The observation: what the robot itself knows."""
