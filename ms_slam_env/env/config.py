@@ -115,7 +115,7 @@ class EnvConfig(Checked):
         mask: how ``action_masks`` knows which motions are possible: ``true`` casts them in the true
             scene from the true pose, ``map`` in the occupancy grid of the robot's own map from the
             estimated pose. There what was not seen is permitted; a motion that then meets
-            something is not made, as a masked one.
+            something is not made, as a masked one, and its end is taken for occupied.
         seconds: simulated time after which an episode is truncated; None for the steps alone.
         divergence: how divergence is measured.
         frame_divergences: whether the divergence of every frame from the one before is measured,

@@ -166,9 +166,15 @@ class Simulation:
 
     def move(self, episode: Episode) -> tuple[bool, float]:
         """Make the episode's motion; was it made, and which area (m2) is newly mapped?"""
-        may = self.config.mask != MAP or bool(self.action_masks()[episode.action])
+        by_map = self.config.mask == MAP
+        may = not by_map or bool(self.action_masks()[episode.action])
+        offset = self.world.embodiment.candidate_motions()[episode.action][:3, 3] if by_map else 0
         with self.timings.stage("move"):
             motion = self.world.embodiment.move(episode.action if may else 0)
+        if by_map and may and not motion.made and np.any(offset):
+            assert episode.occupancy is not None
+            here = episode.T_world_camera_estimate
+            episode.occupancy.touch(here[:3, 3] + here[:3, :3] @ offset)
         return may and motion.made, self._track_motion(episode, motion)
 
     def action_masks(self) -> NDArray[np.bool_]:

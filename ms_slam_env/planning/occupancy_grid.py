@@ -84,6 +84,12 @@ class OccupancyGrid:
         near, _ = cKDTree(self.centres_of(occupied + low)).query(points, distance_upper_bound=FAR_M)
         return np.asarray(np.minimum(near, far))
 
+    def touch(self, point: Float64) -> None:
+        """Something at a point (3,) was run into: its cell is occupied until it is seen free."""
+        cell = np.floor(point / self.cell_m).astype(np.int64)
+        self._grow(cell, cell + 1)
+        self.log_odds[tuple(cell - self.first)] = _CHANGE[STRUCK]
+
     def integrate(
         self, depth: NDArray[np.float32], T_world_camera: Float64, intrinsics: Intrinsics
     ) -> None:

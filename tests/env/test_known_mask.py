@@ -64,6 +64,17 @@ def test_a_grid_says_how_far_the_next_occupied_cell_is():
     np.testing.assert_array_equal(OccupancyGrid().clearance(points), np.full(4, FAR_M))
 
 
+def test_what_was_touched_is_occupied_until_it_is_seen_free():
+    grid = OccupancyGrid()
+    point = np.array([0.05, 0.05, 0.55])
+    for _ in range(2):
+        grid.touch(point)
+        assert grid.clearance(point[None])[0] < 1e-9
+        for _ in range(4):
+            grid.integrate(np.full(CAMERA.shape, 1.05, np.float32), np.eye(4), CAMERA)
+        assert grid.clearance(point[None])[0] == FAR_M
+
+
 @pytest.mark.parametrize(
     ("away_m", "goes_on"), [(0.25, True), (0.23, False), (0.05, False), (-0.15, True)]
 )
@@ -123,6 +134,7 @@ def test_what_was_not_seen_is_permitted_and_then_in_the_way(with_its_back_to_a_w
     assert info["reward_terms"]["blocked"] == -0.1
     np.testing.assert_array_equal(info["T_world_camera"], T)
     np.testing.assert_array_equal(info["action_mask"], observation[-49:].astype(bool))
+    assert not info["action_mask"][BACKWARD]  # it was felt
 
 
 def test_what_the_map_forbids_is_not_made_even_if_it_could_be(with_its_back_to_a_wall):
