@@ -127,11 +127,11 @@ def play(task: Task) -> Path:
     is_over = False
     while not is_over:
         mask, is_tracked = np.array(info["action_mask"], dtype=bool), info["tracking_ok"]
-        wanted = teacher.act(observation, info)
+        wanted = teacher.act(observation, teacher.known(info))
         preferences = teacher.preferences()
         if preferences is None:
             preferences = (np.arange(len(mask)) == wanted) & (task.through is None)
-        action = actor.act(observation, info) if actor else wanted
+        action = actor.act(observation, actor.known(info)) if actor else wanted
         if actor and action != wanted:
             if rng.random() < task.share:
                 action = wanted

@@ -15,7 +15,7 @@ from ms_slam_env.planning.trackability import NEAR_SHARE, bearable, leads_on
 from ms_slam_env.planning.view_goals import best_goal
 
 if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.robot_view import RobotView
 
 
 _REMAINS = 0.3
@@ -40,7 +40,7 @@ class HomeAgent(NextBestView):
     shield, Alshiekh et al., AAAI 2018): the view from here is all that is asked of the map.
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees.
         seed: of the goals drawn.
         path: file of the policy; default: the one that comes with the package.
         **options: see `NextBestView`; ``enough_m3`` is what the best view near by should show.
@@ -51,10 +51,10 @@ class HomeAgent(NextBestView):
     """
 
     def __init__(
-        self, env: ActiveSlamEnv, seed: int = 0, path: str | None = None, **options: Any
+        self, robot: RobotView, seed: int = 0, path: str | None = None, **options: Any
     ) -> None:
-        self.near = HomePolicy(env, seed, path)
-        super().__init__(env, seed, **options)
+        self.near = HomePolicy(robot, seed, path)
+        super().__init__(robot, seed, **options)
         self.check_policy(self.near.policy.metadata.observation)
 
     @staticmethod
@@ -90,12 +90,12 @@ class HomeAgent(NextBestView):
     def choose_motion(self, here: NDArray[np.float64]) -> int:
         """The policy's motion, or the one towards a goal."""
         safe = self.safe_motions(here)
-        wanted = self.near.policy.act(self.seen, safe if safe.any() else self.env.action_masks())
+        wanted = self.near.policy.act(self.seen, safe if safe.any() else self.robot.action_masks())
         self._choices = None
         if self.goal is not None:
             self.judge_goal(here)
         if self.goal is None and not self.must_leave(here) and safe.any():
-            best = best_goal(self.map.grid, here, self.env.intrinsics, self.steps)
+            best = best_goal(self.map.grid, here, self.robot.intrinsics, self.steps)
             if self.gain_of(best[None])[0] >= self.enough_m3:
                 self.given_up = 0
                 self._choices = safe
@@ -107,10 +107,10 @@ class HomeAgent(NextBestView):
 
     def safe_motions(self, here: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which motions (n,) are not likely to slip, as far as the policy's observation says."""
-        poses = self.env.candidate_poses()
+        poses = self.robot.candidate_poses()
         rows = self.seen[self.near.policy.metadata.num_state :].reshape(len(poses), -1)
         of = dict(zip(GRID_NAMES, rows.T.astype(np.float64), strict=False))
-        can = self.env.action_masks() & ~self.near_loss(poses)
+        can = self.robot.action_masks() & ~self.near_loss(poses)
         can &= of["remains"] >= min(_REMAINS, of["remains"][can].max(initial=0))
         can &= of["near"] <= max(NEAR_SHARE, of["near"][0])
         risks = np.where(can, of["slip_risk"], np.inf)

@@ -14,7 +14,7 @@ from ms_slam_env.env import Planner
 from ms_slam_env.errors import InputError
 
 if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.robot_view import RobotView
 
 PATH_VARIABLE = "MS_SLAM_POLICY"
 SHIPPED = Path(__file__).parent / "policies"
@@ -25,7 +25,7 @@ class TrainedPolicy(Planner):
     """A policy trained by ``ms-slam train``, shown the observation that it was trained on.
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees.
         seed: of the draws from the policy's probabilities.
         path: the policy file; default: what the environment variable ``MS_SLAM_POLICY`` names.
         deterministic: take the most probable action instead of drawing one; a truth value or the
@@ -40,19 +40,19 @@ class TrainedPolicy(Planner):
 
     def __init__(
         self,
-        env: ActiveSlamEnv,
+        robot: RobotView,
         seed: int = 0,
         path: str | None = None,
         deterministic: bool | str = False,
     ) -> None:
-        super().__init__(env, seed)
+        super().__init__(robot, seed)
         path = self._path(path)
         self.deterministic = _truth(deterministic)
         self.policy = Policy(_loaded(path, _modified(path)))
         if not self.policy.metadata.epochs:
             raise InputError(f"{path!r} is untrained: its network has had no update")
         try:
-            self.policy.check_fits(env)
+            self.policy.check_fits(self.robot)
         except InputError as error:
             raise InputError(f"{path!r}: {error}") from None
 
@@ -82,7 +82,7 @@ class TrainedPolicy(Planner):
         An integer, or an array of them where an action has several.
         """
         rng = None if self.deterministic else self.rng
-        return self.policy.act(observation, self.env.action_masks(), rng)
+        return self.policy.act(observation, self.robot.action_masks(), rng)
 
     def see(self, observation: Any, info: dict[str, Any]) -> None:
         """See the base class."""
@@ -98,12 +98,12 @@ class ShippedAgent(TrainedPolicy):
 
     def __init__(
         self,
-        env: ActiveSlamEnv,
+        robot: RobotView,
         seed: int = 0,
         path: str | None = None,
         deterministic: bool | str = True,
     ) -> None:
-        super().__init__(env, seed, path, deterministic)
+        super().__init__(robot, seed, path, deterministic)
 
 
 class RoomAgent(ShippedAgent):

@@ -69,7 +69,7 @@ class ThroughPlanner(gym.Wrapper[Any, Any, Any, Any]):
         return self._masks
 
     def _ask(self, observation: Any, info: dict[str, Any]) -> dict[str, Any]:
-        self._wanted = self._planner.act(observation, info)
+        self._wanted = self._planner.act(observation, self._planner.known(info))
         choices = self._planner.choices()
         if choices is None:
             choices = np.arange(len(info["action_mask"])) == self._wanted

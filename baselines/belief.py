@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ms_slam_baselines.nbv import NextBestView
@@ -15,6 +15,9 @@ from ms_slam_env.planning import view_information
 from ms_slam_env.planning.trackability import SCALE, mean_depth, risk_of
 from ms_slam_env.planning.view_goals import distance_in_steps
 from ms_slam_env.slam.slam_backend import Views
+
+if TYPE_CHECKING:
+    from ms_slam_env.env.robot_view import RobotView
 
 CORRECT_M = 0.05
 """How far from its place surface may be to count."""
@@ -40,7 +43,7 @@ class Belief(NextBestView):
     grows (Carrillo, Reid, Castellanos, ICRA 2012, on D-optimality).
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees.
         seed: of the goals drawn.
         caution: price of uncertainty, see above.
         **options: see `NextBestView`.
@@ -49,8 +52,10 @@ class Belief(NextBestView):
         InputError: an option out of its range.
     """
 
-    def __init__(self, env: Any, seed: int = 0, caution: float = 1.0, **options: Any) -> None:
-        super().__init__(env, seed, **options)
+    def __init__(
+        self, robot: RobotView, seed: int = 0, caution: float = 1.0, **options: Any
+    ) -> None:
+        super().__init__(robot, seed, **options)
         self.caution = caution
         self.check({"caution": (0, 1e6)})
 
@@ -60,7 +65,7 @@ class Belief(NextBestView):
         best = np.argsort(-worth * self.is_new(poses, here))[:_COMPARED]
         ways = np.stack([poses_between(here, poses[n], _STOPS) for n in best])
         seen_from = np.concatenate([here[None], ways.reshape(-1, 4, 4)])
-        views = self.env.slam.predict(seen_from, SCALE)
+        views = self.robot.predict(seen_from, SCALE)
         correct, growth = self.along(ways, views, distance_in_steps(poses[best], here, *self.steps))
         value = worth[best] * correct - self.caution * worth[best[0]] * growth / CORRECT_M**2
         return poses[best[int(np.argmax(value))]]
@@ -77,8 +82,8 @@ class Belief(NextBestView):
             the probability (K,) that surface seen from the end lands within 5 cm, and by how much
             the D-optimality (K,) of the covariance has grown.
         """
-        episode, count = self.env.episode, ways.shape[1]
-        start = _START if episode.pose_covariance is None else np.array(episode.pose_covariance)
+        covariance, count = self.robot.pose_covariance, ways.shape[1]
+        start = _START if covariance is None else np.array(covariance)
         H, depth = view_information(views), mean_depth(views)
         information = in_metres_and_radians(H, depth)
         information *= trust(start, information[0])
@@ -87,7 +92,7 @@ class Belief(NextBestView):
         turn /= self.frames
         slips = risk_of(H, views, np.r_[0, np.repeat(turn, count)], depth)[1:].reshape(-1, count)
         holds = np.prod((1 - slips) ** (self.frames * motions[:, None]), axis=1)
-        here = episode.T_world_camera_estimate
+        here = self.robot.T_world_camera_estimate
         ends = [
             propagated(start, [here, *way], of_way, between)
             for way, of_way, between in zip(

@@ -11,26 +11,26 @@ from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import check_range, check_whole
-from ms_slam_env.env import Planner
+from ms_slam_env.env import PrivilegedPlanner
 from ms_slam_env.env.config import RewardConfig
 from ms_slam_env.errors import unknown
 
 if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.robot_view import PrivilegedView
 
 
 ORDERS = ("random", "greedy")
 TERMS = tuple(field.name for field in fields(RewardConfig))
 
 
-class Foresight(Planner):
+class Foresight(PrivilegedPlanner):
     """Makes the motion with the largest reward, having tried them in the simulator.
 
     One step ahead, whatever the reward is. No rival, since a robot cannot take a motion back: it
     says what there is to gain, and an agent can learn from it (see `oracle`).
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees, the truth included.
         seed: of the motions drawn.
         tried: how many of the possible motions are tried.
         order: which: ``random`` draws anew for each decision, ``greedy`` takes those whose
@@ -49,7 +49,7 @@ class Foresight(Planner):
 
     def __init__(
         self,
-        env: ActiveSlamEnv,
+        robot: PrivilegedView,
         seed: int = 0,
         tried: int = 49,
         order: str = "random",
@@ -57,7 +57,7 @@ class Foresight(Planner):
         temperature: float = 0.02,
         without: str = "",
     ) -> None:
-        super().__init__(env, seed)
+        super().__init__(robot, seed)
         self.tried, self.order = tried, order
         self.noise, self.temperature = noise, temperature
         check_range(self, "tried", 1, 1000)
@@ -74,17 +74,17 @@ class Foresight(Planner):
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Try some motions, take the best of them."""
-        possible = self._first(np.flatnonzero(self.env.action_masks()))
-        rewards = np.array([self._worth(terms) for terms in self.env.foresee_terms(possible)])
-        self.weights = np.zeros(len(self.env.action_masks()))
+        possible = self._first(np.flatnonzero(self.robot.action_masks()))
+        rewards = np.array([self._worth(terms) for terms in self.robot.foresee_terms(possible)])
+        self.weights = np.zeros(len(self.robot.action_masks()))
         self.weights[possible] = np.exp((rewards - rewards.max()) / self.temperature)
         return int(possible[np.argmax(rewards)])
 
     def _first(self, possible: NDArray[np.int64]) -> NDArray[np.int64]:
         """Those of the possible motions that are tried."""
         if self.order == "greedy":
-            predicted = self.env.lookahead()[possible].T
-            order = np.argsort(distance_to_targets(*predicted, self.env.config.targets))
+            predicted = self.robot.lookahead()[possible].T
+            order = np.argsort(distance_to_targets(*predicted, self.robot.targets))
         else:
             order = self.rng.permutation(len(possible))
         return possible[order[: self.tried]]

@@ -18,7 +18,7 @@ from ms_slam_env.planning import FREE, OccupancyMap, expected_gain, shortest_way
 from ms_slam_env.planning.view_goals import distance_in_steps
 
 if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.robot_view import RobotView
 
 
 ARRIVED = 3  # steps from a goal
@@ -42,7 +42,7 @@ class GoalPlanner(Planner):
     the walls, wherever in known free space (as Dang et al., J. Field Robotics 2020, do globally).
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees.
         seed: of the goals drawn.
         goals: positions drawn for a goal.
         radius_m: how far a goal may be.
@@ -62,7 +62,7 @@ class GoalPlanner(Planner):
 
     def __init__(
         self,
-        env: ActiveSlamEnv,
+        robot: RobotView,
         seed: int = 0,
         goals: int = 160,
         radius_m: float = 2.5,
@@ -73,12 +73,12 @@ class GoalPlanner(Planner):
         enough_m3: float = 1.0,
         far_m: float = 12.0,
     ) -> None:
-        super().__init__(env, seed)
+        super().__init__(robot, seed)
         self.goals, self.radius_m, self.cost = goals, radius_m, cost
         self.replan, self.cell_m, self.reach_m = replan, cell_m, reach_m
         self.enough_m3, self.far_m = enough_m3, far_m
         self.check(_RANGES, "goals", "replan")
-        self.steps = max(env.config.step_m, _LEAST), max(env.config.step_rad, _LEAST)
+        self.steps = max(self.robot.step_m, _LEAST), max(self.robot.step_rad, _LEAST)
         self.reset()
 
     def check(self, ranges: Mapping[str, tuple[float, float]], *counted: str) -> None:
@@ -110,7 +110,7 @@ class GoalPlanner(Planner):
 
     def instead(self, action: int) -> None:
         """Remember where the motion that was made leads."""
-        self.heading_to = self.env.candidate_poses()[action]
+        self.heading_to = self.robot.candidate_poses()[action]
 
     def lost_by(self, action: int) -> None:
         """Keep away from where the last motion should have led."""
@@ -119,12 +119,11 @@ class GoalPlanner(Planner):
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Carve the last frame, choose a motion."""
-        episode = self.env.episode
-        here = episode.T_world_camera_estimate
+        here = self.robot.T_world_camera_estimate
         if info["tracking_ok"]:
-            self.map.add(self.env.slam, episode.last_frame.depth, here, self.env.intrinsics)
+            self.map.add(self.robot, self.robot.last_frame.depth, here, self.robot.intrinsics)
         action = self.choose_motion(here)
-        self.heading_to = self.env.candidate_poses()[action]
+        self.heading_to = self.robot.candidate_poses()[action]
         if np.allclose(self.heading_to, here):  # it stays
             self.goal = None
         return action
@@ -214,7 +213,7 @@ class GoalPlanner(Planner):
 
     def gain_of(self, poses: Float64) -> Float64:
         """Expected gain (N,) of poses (N, 4, 4), m^3."""
-        return expected_gain(self.map.grid, poses, self.env.intrinsics)
+        return expected_gain(self.map.grid, poses, self.robot.intrinsics)
 
     def is_new(self, goals: Float64, here: Float64) -> NDArray[np.bool_]:
         """Which goals (N, 4, 4) are neither where the camera is (4, 4) nor done with."""

@@ -40,7 +40,7 @@ class GraphDOptimality(NextBestView):
     Where there is no frontier, the goal is that of `nbv`. Motions on the way are chosen as there.
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees.
         seed: of the goals drawn where there is no frontier.
         **options: see `NextBestView`.
 
@@ -57,7 +57,7 @@ class GraphDOptimality(NextBestView):
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Add a keyframe where the camera has moved on, then as `nbv` does."""
-        here = self.env.episode.T_world_camera_estimate
+        here = self.robot.T_world_camera_estimate
         if info["tracking_ok"] and self.has_moved_on(here):
             self.weights = extended(self.weights, self.edges_to(here[None]))
             self.keyframes.append(self.keyframe(here))
@@ -71,10 +71,10 @@ class GraphDOptimality(NextBestView):
     def keyframe(self, here: Float64) -> Keyframe:
         """The last frame, taken at a pose (4, 4), as a node."""
         every = (slice(_THUMBNAIL // 2, None, _THUMBNAIL),) * 2
-        depth = self.env.episode.last_frame.depth[every]
+        depth = self.robot.last_frame.depth[every]
         read = np.where(depth > 0, depth, np.nan)
-        points = (self.env.intrinsics.rays()[every] * read[..., None]).reshape(-1, 3)
-        covariance = self.env.episode.pose_covariance
+        points = (self.robot.intrinsics.rays()[every] * read[..., None]).reshape(-1, 3)
+        covariance = self.robot.pose_covariance
         weight = 1 / max(d_optimality(_START if covariance is None else covariance), 1e-30)
         return Keyframe(here, transform_points(here, points), weight)
 
@@ -86,7 +86,7 @@ class GraphDOptimality(NextBestView):
         if not self.keyframes:
             return np.zeros((0, len(way)))
         surfaces = np.stack([k.surface for k in self.keyframes])
-        shares = shares_seen(surfaces, way, self.env.intrinsics)
+        shares = shares_seen(surfaces, way, self.robot.intrinsics)
         weights = np.array([[k.weight] for k in self.keyframes])
         edges = weights * np.where(shares >= _SEEN_AGAIN, shares, 0)
         edges[-1, 0] = max(edges[-1, 0], _SEEN_AGAIN * weights[-1, 0])

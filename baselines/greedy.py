@@ -16,7 +16,7 @@ from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.errors import InputError, unknown
 
 if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.robot_view import RobotView
 
 
 PRESETS = ("environment", "paper")
@@ -36,7 +36,7 @@ class GreedyDivergence(Planner):
     the current one than the current one. Exploration comes from targets above zero alone.
 
     Args:
-        env: the unwrapped environment; its configured targets are the defaults below.
+        robot: what it sees; its environment's targets are the defaults below.
         seed: unused, the planner draws nothing at random.
         preset: ``environment`` predicts, compares and aims as the environment is configured;
             ``paper`` as Algorithm 1 is printed: views of full size against the last live frame,
@@ -55,7 +55,7 @@ class GreedyDivergence(Planner):
 
     def __init__(
         self,
-        env: ActiveSlamEnv,
+        robot: RobotView,
         seed: int = 0,
         preset: str = "environment",
         rho_I: float | None = None,
@@ -63,20 +63,21 @@ class GreedyDivergence(Planner):
         depth_weight: float | None = None,
         calibration: float = 0.0,
     ) -> None:
-        super().__init__(env, seed)
+        super().__init__(robot, seed)
         self.calibration = calibration
         check_range(self, "calibration", 0, 1)
         if preset not in PRESETS:
             raise unknown("preset of greedy", preset, PRESETS)
         options = {"rho_I": rho_I, "rho_D": rho_D, "depth_weight": depth_weight}
         given: dict[str, Any] = {k: _number(v) for k, v in options.items() if v is not None}
-        self.predicted = env.lookahead
-        targets = env.config.targets
+        self.predicted = self.robot.lookahead
+        targets = self.robot.targets
         if preset == "paper" and calibration:
             raise InputError("greedy calibrates what it meets: preset=environment only")
         if preset == "paper":
             self.predicted, targets = self._predicted_as_printed, PAPER_TARGETS
-            self._lookahead = Lookahead(PAPER_LOOKAHEAD, DivergenceConfig.paper(), env.intrinsics)
+            measure, camera = DivergenceConfig.paper(), self.robot.intrinsics
+            self._lookahead = Lookahead(PAPER_LOOKAHEAD, measure, camera)
         self.targets = replace(targets, **given)
         self.reset()
 
@@ -89,7 +90,7 @@ class GreedyDivergence(Planner):
         """Algorithm 1; the loop over candidates, lines 3 to 8, is one batch."""
         if self.calibration and self._expected is not None and info["tracking_ok"]:
             self.learn(self._expected, info["divergence"])
-        T = np.flatnonzero(self.env.action_masks())  # line 2: motions within reach
+        T = np.flatnonzero(self.robot.action_masks())  # line 2: motions within reach
         predicted = self.predicted()[T]  # lines 1 and 3 to 8: predict and compare
         delta_I, delta_D = (predicted * np.exp(self.log_factor)).T
         i_star = np.argmin(distance_to_targets(delta_I, delta_D, self.targets))  # line 9
@@ -111,11 +112,9 @@ class GreedyDivergence(Planner):
 
     def _predicted_as_printed(self) -> Float64:
         """Divergences (n, 2) of the predicted images from I_t-1 and D_t-1, the last live ones."""
-        here = self.env.episode
-        poses = self.env.candidate_poses()
-        return self._lookahead.divergences(
-            self.env.slam, poses, here.T_world_camera_estimate, here.last_frame
-        )
+        robot = self.robot
+        here, poses = robot.T_world_camera_estimate, robot.candidate_poses()
+        return self._lookahead.divergences(robot, poses, here, robot.last_frame)
 
 
 def distance_to_targets(delta_I: Float64, delta_D: Float64, targets: TargetConfig) -> Float64:

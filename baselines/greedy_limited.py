@@ -16,7 +16,7 @@ from ms_slam_env.planning.trackability import SCALE
 from ms_slam_env.planning.view_goals import distance_in_steps
 
 if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.robot_view import RobotView
 
 
 _EMPTY_NATS = np.array([0.4, 0.8])
@@ -40,7 +40,7 @@ class GreedyLimited(GoalPlanner):
     optimisation for the next motion can be combined with any globally planned trajectory".
 
     Args:
-        env: the unwrapped environment, with its targets and its measure of divergence.
+        robot: what it sees, with targets and a measure of divergence.
         seed: of the goals drawn.
         violations: share of the motions that may exceed M_I or M_D.
         rho: share of M_I and M_D to aim at, in [0, 1].
@@ -52,17 +52,18 @@ class GreedyLimited(GoalPlanner):
 
     def __init__(
         self,
-        env: ActiveSlamEnv,
+        robot: RobotView,
         seed: int = 0,
         violations: float = 0.05,
         rho: float = 1.0,
         **options: Any,
     ) -> None:
-        super().__init__(env, seed, **options)
+        super().__init__(robot, seed, **options)
         self.violations, self.rho = violations, rho
         self.check({"violations": (0, 1), "rho": (0, 1)})
-        self.targets = replace(env.config.targets, rho_I=self.rho, rho_D=self.rho)
-        self.measure = make_divergence(env.config.divergence, env.intrinsics.scaled(SCALE))
+        self.targets = replace(self.robot.targets, rho_I=self.rho, rho_D=self.rho)
+        camera = self.robot.intrinsics.scaled(SCALE)
+        self.measure = make_divergence(self.robot.divergence_config, camera)
 
     def reset(self) -> None:
         """The factor is that of the training seeds."""
@@ -93,7 +94,7 @@ class GreedyLimited(GoalPlanner):
 
     def motion_towards(self, goal: Float64) -> int:
         """Of the permitted motions that lead to the goal the one closest to the targets."""
-        poses = self.env.candidate_poses()
+        poses = self.robot.candidate_poses()
         expected = self.expected_divergences(poses)
         permitted = self.permitted(expected) & ~self.near_loss(poses)
         away = distance_in_steps(poses, goal, *self.steps).sum(axis=1)
@@ -110,8 +111,8 @@ class GreedyLimited(GoalPlanner):
 
         As predicted from the map against its view of here, and what empty pixels may hold.
         """
-        here = self.env.episode.T_world_camera_estimate
-        views = self.env.slam.predict(np.concatenate([here[None], poses]), SCALE)
+        here = self.robot.T_world_camera_estimate
+        views = self.robot.predict(np.concatenate([here[None], poses]), SCALE)
         histograms = self.measure.histograms(views.intensity, views.depth, views.normals)
         empty = (views.depth == 0).mean(axis=(1, 2))
         divergences = self.measure.divergence(histograms, histograms[0])
@@ -123,8 +124,8 @@ class GreedyLimited(GoalPlanner):
         If none but to stay, also those that exceed them least: near a surface every motion does.
         """
         bound = (expected + _FLOOR_NATS) * np.exp(self.log_factor) - _FLOOR_NATS
-        excess = (bound / self.env.config.targets.maxima).max(axis=1)
-        possible = self.env.action_masks()
+        excess = (bound / self.robot.targets.maxima).max(axis=1)
+        possible = self.robot.action_masks()
         permitted = possible & (excess <= 1)
         if not permitted[1:].any():
             excess = np.where(possible, excess, np.inf)

@@ -11,7 +11,7 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.planning import held_gain
 
 if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.robot_view import RobotView
 
 
 _CHOICE = 0.05  # of what the best motion shows: so much less, and a motion is 1/e as good a choice
@@ -25,7 +25,7 @@ class HeldNextBestView(NextBestView):
     that SLAM can follow, see `nbv`. Where none shows enough it goes to a goal as `nbv` does.
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees.
         seed: of the goals drawn.
         horizon: steps that a motion is held.
         discount: of what one more step shows.
@@ -41,7 +41,7 @@ class HeldNextBestView(NextBestView):
 
     def __init__(
         self,
-        env: ActiveSlamEnv,
+        robot: RobotView,
         seed: int = 0,
         horizon: int = 6,
         discount: float = 0.93,
@@ -50,7 +50,7 @@ class HeldNextBestView(NextBestView):
         slip_cost: float = 0.0,
         **options: Any,
     ) -> None:
-        super().__init__(env, seed, enough_m3=enough_m3, **options)
+        super().__init__(robot, seed, enough_m3=enough_m3, **options)
         self.horizon, self.discount = horizon, discount
         self.least_m3, self.slip_cost = least_m3, slip_cost
         self.check({"horizon": (1, 100), "discount": (0, 1)}, "horizon")
@@ -66,7 +66,7 @@ class HeldNextBestView(NextBestView):
         self.weights = None
         values = self.values(here)
         if not self.must_leave(here) and values.max() >= self.least_m3:
-            best = self.best_admissible(self.env.candidate_poses(), values)
+            best = self.best_admissible(self.robot.candidate_poses(), values)
             values = np.where(self.can, values, 0)
             if self.slip_cost:
                 values -= self.slip_cost * np.where(self.can, self.seen_risks, 0)
@@ -84,6 +84,6 @@ class HeldNextBestView(NextBestView):
 
     def values(self, here: Float64) -> Float64:
         """Discounted volume (n,) in m^3 that each motion shows from a pose (4, 4)."""
-        motions = self.env.embodiment.candidate_motions()
-        gain = held_gain(self.map.grid, here, motions, self.horizon, self.env.intrinsics)
+        motions = self.robot.candidate_motions()
+        gain = held_gain(self.map.grid, here, motions, self.horizon, self.robot.intrinsics)
         return np.asarray(gain @ self.discount ** np.arange(self.horizon))

@@ -21,7 +21,7 @@ class MaxInformation(Planner):
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
         """Choose the unmasked action with the largest gain, ties drawn at random."""
-        depth = self.env.predict_candidates().depth  # (n, h, w) metres, 0 = the map is empty
+        depth = self.robot.predict_candidates().depth  # (n, h, w) metres, 0 = the map is empty
         unseen = np.count_nonzero(depth == 0, axis=(1, 2))  # (n,) pixels
-        unseen[~self.env.action_masks()] = -1
+        unseen[~self.robot.action_masks()] = -1
         return int(self.rng.choice(np.flatnonzero(unseen == unseen.max())))

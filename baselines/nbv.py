@@ -15,7 +15,7 @@ from ms_slam_env.planning.trackability import SCALE, bearable, follow_risks, lea
 from ms_slam_env.planning.view_goals import distance_in_steps
 
 if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.robot_view import RobotView
 
 
 _FAR_APART_RAD = math.radians(16)
@@ -31,7 +31,7 @@ class NextBestView(GoalPlanner):
     those whose predicted view shows enough of the map, is not too near, and is not likely to slip.
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees.
         seed: of the goals drawn.
         overlap: share of a view that the map should fill.
         risk: probability that a frame may have to slip, see `trackability`; twice as much with
@@ -45,14 +45,14 @@ class NextBestView(GoalPlanner):
 
     def __init__(
         self,
-        env: ActiveSlamEnv,
+        robot: RobotView,
         seed: int = 0,
         overlap: float = 0.5,
         risk: float = 0.02,
         own_gain: float = 1.0,
         **options: Any,
     ) -> None:
-        super().__init__(env, seed, **options)
+        super().__init__(robot, seed, **options)
         self.overlap, self.risk, self.own_gain = overlap, risk, own_gain
         self.far_apart = self.steps[1] > _FAR_APART_RAD
         self.check({"overlap": (0, 1), "risk": (0, 1), "own_gain": (0, 1000)})
@@ -60,12 +60,12 @@ class NextBestView(GoalPlanner):
     @property
     def frames(self) -> int:
         """Frames that a motion has: each has its part of the way, and its risk to slip."""
-        return self.env.embodiment.frames_per_motion
+        return self.robot.frames_per_motion
 
     def motion_towards(self, goal: Float64) -> int:
         """The admissible motion that comes nearest to a goal (4, 4) and gains something itself."""
-        poses = self.env.candidate_poses()
-        gain = expected_gain(self.map.grid, poses, self.env.intrinsics, (12, 9))
+        poses = self.robot.candidate_poses()
+        gain = expected_gain(self.map.grid, poses, self.robot.intrinsics, (12, 9))
         score = self.own_gain * gain / max(gain.max(), 1e-9)
         score -= distance_in_steps(poses, goal, *self.steps).sum(axis=1)
         return self.best_admissible(poses, score)
@@ -84,9 +84,9 @@ class NextBestView(GoalPlanner):
         To stay, or but to roll, is none of them, unless there is no other. With an ``order`` (n,)
         it is said only of the first that is, and of those before it.
         """
-        possible = self.env.action_masks()
+        possible = self.robot.action_masks()
         permitted = possible & ~self.near_loss(poses)
-        leads = leads_on(poses, self.env.episode.T_world_camera_estimate)
+        leads = leads_on(poses, self.robot.T_world_camera_estimate)
         risk = min(self.risk * 2**self.given_up, 1.0)
         self.seen_risks = risks = np.full(len(poses), np.inf)
         for some in _in_turn(order, permitted, leads):
@@ -103,8 +103,8 @@ class NextBestView(GoalPlanner):
 
         Infinite where a motion is not permitted or leads to a view that SLAM cannot follow.
         """
-        seen_from = np.concatenate([self.env.episode.T_world_camera_estimate[None], poses])
-        views = self.env.slam.predict(seen_from, SCALE)
+        seen_from = np.concatenate([self.robot.T_world_camera_estimate[None], poses])
+        views = self.robot.predict(seen_from, SCALE)
         return follow_risks(views, seen_from, np.r_[True, permitted], self.overlap, self.frames)[1:]
 
 

@@ -9,13 +9,14 @@ from ms_slam_baselines.held_nbv import HeldNextBestView
 
 from ms_slam_env._runtime.arrays import Bool, Float32, Float64
 from ms_slam_env.config import check_choice
+from ms_slam_env.env import PrivilegedPlanner
 from ms_slam_env.evaluation.map_truth import reference_surface
 from ms_slam_env.planning.expected_gain import held_ways
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.tasks import REFERENCES
 
 if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.robot_view import PrivilegedView
 
 
 _NEAREST_M, _FARTHEST_M = 0.3, 4.0  # of what a frame maps well
@@ -24,7 +25,7 @@ _PLACED_M = 0.04  # error of the pose up to which a frame maps in the true place
 _CLEARANCE_M = 0.12
 
 
-class Oracle(HeldNextBestView):
+class Oracle(PrivilegedPlanner, HeldNextBestView):
     """`held-nbv` that reads from the scene what each motion would show of the task's surface.
 
     It moves by the same rules, by motions that SLAM can follow. No rival, since it sees what a
@@ -32,7 +33,7 @@ class Oracle(HeldNextBestView):
     looking at ("privileged" teacher: Chen et al., "Learning by cheating", CoRL 2020).
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees, the truth included.
         seed: of the goals drawn.
         reference: the surface to be mapped, as a task has it: nearby, scene or arm.
         points: of that surface that are counted.
@@ -46,7 +47,7 @@ class Oracle(HeldNextBestView):
 
     def __init__(
         self,
-        env: ActiveSlamEnv,
+        robot: PrivilegedView,
         seed: int = 0,
         reference: str = "nearby",
         points: int = 2000,
@@ -54,7 +55,8 @@ class Oracle(HeldNextBestView):
         slip_cost: float = 1.0,
         **options: Any,
     ) -> None:
-        super().__init__(env, seed, least_m3=least, enough_m3=least, slip_cost=slip_cost, **options)
+        given: dict[str, Any] = {"least_m3": least, "enough_m3": least, "slip_cost": slip_cost}
+        super().__init__(robot, seed, **given, **options)
         self.reference, self.points = reference, points
         check_choice(self, "reference", REFERENCES)
         self.check({"points": (1, 1_000_000)}, "points")
@@ -72,9 +74,9 @@ class Oracle(HeldNextBestView):
             self._begin()
         self._look()
         assert self.left is not None
-        motions = self.env.embodiment.candidate_motions()
-        way = held_ways(self.env.episode.frames[-1].T_world_camera, motions, self.horizon)
-        fits = self.env.scene.clearance(way[:, :, :3, 3].reshape(-1, 3)) > _CLEARANCE_M
+        motions = self.robot.candidate_motions()
+        way = held_ways(self.robot.episode.frames[-1].T_world_camera, motions, self.horizon)
+        fits = self.robot.scene.clearance(way[:, :, :3, 3].reshape(-1, 3)) > _CLEARANCE_M
         goes_on = np.logical_and.accumulate(fits.reshape(way.shape[:2]), axis=1)
         seen = np.zeros((*way.shape[:2], len(self.left)), dtype=bool)
         seen[goes_on] = self._sees(way[goes_on])
@@ -88,17 +90,17 @@ class Oracle(HeldNextBestView):
 
     def _begin(self) -> None:
         """Draw the points of the surface."""
-        env = self.env
-        start = env.episode.frames[0].T_world_camera[:3, 3]
-        every = reference_surface(self.reference, env.scene, start, env.embodiment, env.intrinsics)
+        scene, start = self.robot.scene, self.robot.episode.frames[0].T_world_camera[:3, 3]
+        given = scene, start, self.robot.embodiment, self.robot.intrinsics
+        every = reference_surface(self.reference, *given)
         drawn = np.random.default_rng(0).permutation(len(every))[: self.points]
         self.left, self.total = every[drawn].astype(np.float32), max(1, len(drawn))
-        self.caster = RayCaster(env.scene.mesh.vertices, env.scene.mesh.faces)
+        self.caster = RayCaster(scene.mesh.vertices, scene.mesh.faces)
 
     def _look(self) -> None:
         """Take away what the frames since the last decision have mapped in its place."""
         assert self.left is not None
-        frames = self.env.episode.frames
+        frames = self.robot.episode.frames
         for frame in frames[self.looked_at :]:
             if frame.tracking_ok and frame.pose_error < _PLACED_M:
                 self.left = self.left[~self._sees(frame.T_world_camera[None])[0]]
@@ -117,7 +119,7 @@ class Oracle(HeldNextBestView):
     def _in_view(self, poses: Float64) -> Bool:
         """Which points (M, N) lie in the image of cameras at poses (M, 4, 4)."""
         assert self.left is not None
-        camera = self.env.intrinsics
+        camera = self.robot.intrinsics
         to_camera = np.linalg.inv(poses).astype(np.float32)
         x, y, z = np.moveaxis(
             self.left @ to_camera[:, :3, :3].transpose(0, 2, 1) + to_camera[:, None, :3, 3], 2, 0

@@ -18,7 +18,7 @@ class RandomWalk(Planner):
 
     def act(self, observation: Any, info: dict[str, Any]) -> Any:
         """Draw an action uniformly from the unmasked ones, number by number if it has several."""
-        mask, space = self.env.action_masks(), self.env.action_space
+        mask, space = self.robot.action_masks(), self.robot.action_space
         if not isinstance(space, MultiDiscrete):
             return int(self.rng.choice(np.flatnonzero(mask)))
         parts = np.split(mask, np.cumsum(space.nvec)[:-1])

@@ -10,7 +10,7 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.planning.view_goals import best_goal
 
 if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.robot_view import RobotView
 
 
 class RecedingNextBestView(NextBestView):
@@ -22,7 +22,7 @@ class RecedingNextBestView(NextBestView):
     gains too little it goes on as `nbv`, to far goals that it keeps.
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees.
         seed: of the far goals drawn.
         enough_m3: unknown volume that a goal near by should show; more, and it leaves for far goals
             too soon.
@@ -33,9 +33,9 @@ class RecedingNextBestView(NextBestView):
     """
 
     def __init__(
-        self, env: ActiveSlamEnv, seed: int = 0, enough_m3: float = 0.3, **options: Any
+        self, robot: RobotView, seed: int = 0, enough_m3: float = 0.3, **options: Any
     ) -> None:
-        super().__init__(env, seed, enough_m3=enough_m3, **options)
+        super().__init__(robot, seed, enough_m3=enough_m3, **options)
 
     def reset(self) -> None:
         """Nothing is known yet."""
@@ -46,7 +46,7 @@ class RecedingNextBestView(NextBestView):
 
     def find_goal(self, here: Float64) -> None:
         """Take the best goal near by, straight ahead, or what `nbv` takes."""
-        best = best_goal(self.map.grid, here, self.env.intrinsics, self.steps)
+        best = best_goal(self.map.grid, here, self.robot.intrinsics, self.steps)
         is_enough = bool(self.gain_of(best[None])[0] >= self.enough_m3)
         self.is_near = not self.must_leave(here) and is_enough
         if self.is_near:

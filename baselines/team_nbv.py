@@ -15,7 +15,7 @@ from ms_slam_env.planning import OccupancyGrid
 
 if TYPE_CHECKING:
     from ms_slam_env.camera import Intrinsics
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
+    from ms_slam_env.env.robot_view import RobotView
 
 
 _LOOK_M = 1.5  # in front of a goal: what it is there to see
@@ -43,7 +43,7 @@ class TeamNextBestView(NextBestView):
     ``join`` it is `NextBestView` in a map without submaps.
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees.
         seed: of the goals drawn.
         spread_m: d at which a team mate's goal takes nothing away; 0: the robots share their map
             but do not divide it.
@@ -57,9 +57,9 @@ class TeamNextBestView(NextBestView):
     mates: list[TeamNextBestView]
 
     def __init__(
-        self, env: ActiveSlamEnv, seed: int = 0, spread_m: float = 3.0, **options: Any
+        self, robot: RobotView, seed: int = 0, spread_m: float = 3.0, **options: Any
     ) -> None:
-        super().__init__(env, seed, **options)
+        super().__init__(robot, seed, **options)
         self.spread_m = spread_m
         check_range(self, "spread_m", 0, 1000)
 

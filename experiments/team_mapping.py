@@ -194,7 +194,8 @@ class Team:
         }
 
     def _step(self, k: int) -> None:
-        action = self._planners[k].act(*self._last[k])
+        (observation, info), planner = self._last[k], self._planners[k]
+        action = planner.act(observation, planner.known(info))
         observation, _, lost, _, info = self._envs[k].step(action)
         self._last[k] = observation, info
         self._stopped[k] = bool(lost)

@@ -6,7 +6,7 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 
@@ -105,20 +105,30 @@ def edges_of(source: str, module: str, is_package: bool, modules: Collection[str
     return (found & set(modules)) - {module}
 
 
+def reached(starts: Iterable[str], edges: Mapping[str, set[str]]) -> set[str]:
+    """The modules that some import, by way of others too."""
+    seen: set[str] = set()
+    open_ = [module for start in starts for module in edges[start]]
+    while open_:
+        module = open_.pop()
+        if module not in seen:
+            seen.add(module)
+            open_.extend(edges[module])
+    return seen
+
+
 def in_circles(edges: Mapping[str, set[str]]) -> set[str]:
     """The modules that import themselves by way of others."""
+    return {module for module in edges if module in reached([module], edges)}
 
-    def reached(start: str) -> set[str]:
-        seen: set[str] = set()
-        open_ = list(edges[start])
-        while open_:
-            module = open_.pop()
-            if module not in seen:
-                seen.add(module)
-                open_.extend(edges[module])
-        return seen
 
-    return {module for module in edges if module in reached(module)}
+def edges_of_all() -> dict[str, set[str]]:
+    """What each module of the package imports of it."""
+    names = {module_name(path): path for path in FILES}
+    return {
+        name: edges_of(path.read_text(), name, path.name == "__init__.py", names)
+        for name, path in names.items()
+    }
 
 
 def violations(source: str, module: str, is_package: bool = False) -> list[str]:
@@ -182,12 +192,32 @@ def test_a_right_import_passes(source: str, module: str) -> None:
 
 
 def test_no_imports_go_in_a_circle() -> None:
-    names = {module_name(path): path for path in FILES}
-    edges = {
-        name: edges_of(path.read_text(), name, path.name == "__init__.py", names)
-        for name, path in names.items()
-    }
-    assert sorted(in_circles(edges)) == []
+    assert sorted(in_circles(edges_of_all())) == []
+
+
+ENTRY = "ms_slam_env.env.make"
+"""What Gymnasium imports for every id."""
+DEFAULTS = {
+    "ms_slam_env.slam.surfel",
+    "ms_slam_env.scenes.living_room",
+    "ms_slam_env.robot.arm.dynamic_arm",
+}
+"""What the names stand for that `MSActiveSLAM-v0` has if nobody gives others."""
+
+
+@pytest.mark.parametrize(
+    ("starts", "most"), [({ENTRY}, 30_000), ({ENTRY, *DEFAULTS}, 33_500)], ids=["entry", "defaults"]
+)
+def test_what_gym_make_needs_fits_in_a_head(starts: set[str], most: int) -> None:
+    """Lines of all modules that are imported on the way, also in functions and for types alone.
+
+    What is chosen by name is left out: it is a text, imported where it is asked for.
+    """
+    lines = {module_name(path): len(path.read_text().splitlines()) for path in FILES}
+    needed = starts | reached(starts, edges_of_all())
+    assert "ms_slam_env.slam.slam_backend" in needed
+    assert "ms_slam_env.slam.sparse" not in needed
+    assert sum(lines[module] for module in needed) <= most
 
 
 def test_a_circle_is_found_and_what_only_looks_like_one_is_not() -> None:

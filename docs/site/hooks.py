@@ -247,7 +247,7 @@ def _perturbed() -> Iterator[str]:
     import gymnasium as gym
 
     from ms_slam_env import PERTURBED_ENV_IDS
-    from ms_slam_env.sequences.perturbations import PERTURBATIONS
+    from ms_slam_env.sequences.perturbations import POINT
 
     by_name: dict[str, list[str]] = {}
     for env_id in PERTURBED_ENV_IDS:
@@ -257,7 +257,7 @@ def _perturbed() -> Iterator[str]:
         is_filmed = (ROOT / "docs" / "pictures" / film).is_file()
         shown = f"![What the camera takes](../pictures/{film})\n\n" if is_filmed else ""
         listed = ", ".join(f"`{env_id}`" for env_id in ids)
-        what = _summary(PERTURBATIONS[name])
+        what = _summary(POINT.find(name))
         yield PERTURBED.format(name=f"`{name}`", what=what, ids=listed, film=shown)
 
 

@@ -266,7 +266,8 @@ def play(env: gymnasium.Env[Any, Any], options: Options) -> Iterator[Image]:
     view = VIEWS[options.view](world, planner)
     yield view.draw()
     for step in Bar(range(1, options.steps + 1), options.planner, unit="step"):
-        observation, _, terminated, truncated, info = env.step(planner.act(observation, info))
+        action = planner.act(observation, planner.known(info))
+        observation, _, terminated, truncated, info = env.step(action)
         view.see()
         is_over = terminated or truncated
         if is_over or step % options.every == 0:

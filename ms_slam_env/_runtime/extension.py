@@ -91,11 +91,8 @@ class ExtensionPoint:
         return self._load(entry.name, entry.value, again)
 
     def _load(self, name: str, value: str, hint: str) -> Any:
-        module_name, _, path = value.partition(":")
         try:
-            found: Any = import_module(module_name)
-            for part in path.split("."):
-                found = getattr(found, part)
+            found = load_reference(value)
         except ModuleNotFoundError as error:
             extra = _EXTRAS.get(error.name or "")
             hint = f"; pip install 'ms-slam-env[{extra}]'" if extra else hint
@@ -115,6 +112,15 @@ class ExtensionPoint:
                 f"{self.kind} {name!r} is not a subclass of {module}.{self.base.__name__}"
             )
         return found
+
+
+def load_reference(value: str) -> Any:
+    """What a text ``module:attribute`` stands for; its module is imported now."""
+    module, _, path = value.partition(":")
+    found: Any = import_module(module)
+    for part in path.split("."):
+        found = getattr(found, part)
+    return found
 
 
 def is_reference(name: str) -> bool:

@@ -209,7 +209,7 @@ def play(
     over = False
     while not over:
         began = time.perf_counter()
-        action = planner.act(observation, info)
+        action = planner.act(observation, planner.known(info))
         decision_s += time.perf_counter() - began
         observation, reward, terminated, truncated, info = env.step(action)
         over = terminated or truncated or info["time"] >= seconds

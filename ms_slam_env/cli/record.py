@@ -237,7 +237,7 @@ def _play(env: gym.Env[Any, Any], args: Args, seed: int) -> Steps:
     seen, known, steps = [observation], [info], []
     is_over = False
     while not is_over:
-        action = planner.act(observation, info)
+        action = planner.act(observation, planner.known(info))
         observation, reward, terminated, truncated, info = env.step(action)
         seen.append(observation)
         known.append(info)

@@ -83,7 +83,7 @@ def _play(env: gym.Env[Any, Any], args: Args) -> None:
         with kept("the steps so far are shown"):
             view.log(planner)
             for _ in Bar(range(args.steps), "steps", unit="step"):
-                action = planner.act(observation, info)
+                action = planner.act(observation, planner.known(info))
                 observation, _, terminated, truncated, info = env.step(action)
                 view.log(planner)
                 if terminated or truncated:

@@ -8,9 +8,10 @@ if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
     from ms_slam_env.env.config import EnvConfig, LookaheadConfig
     from ms_slam_env.env.episode import Episode
-    from ms_slam_env.env.planners import Planner
+    from ms_slam_env.env.planners import Planner, PrivilegedPlanner
     from ms_slam_env.env.reward import RewardConfig, TargetConfig
     from ms_slam_env.env.robot_knowledge import STATE_NAMES
+    from ms_slam_env.env.robot_view import PrivilegedView, RobotView
 else:
     __getattr__ = lazy_names(__name__)
 
@@ -21,6 +22,9 @@ __all__ = [
     "Episode",
     "LookaheadConfig",
     "Planner",
+    "PrivilegedPlanner",
+    "PrivilegedView",
     "RewardConfig",
+    "RobotView",
     "TargetConfig",
 ]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env import slam as slam_backends
 from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env._runtime.extension import load_reference
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.env.actions import ActionDecoder, MotionActions, MotionAndConfigurationActions
 from ms_slam_env.env.camera_feed import CameraFeed, make_camera_feed
@@ -20,7 +21,6 @@ from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.env.observations import CONFIGURATION, make_observation
-from ms_slam_env.env.rendering import draw_moment
 from ms_slam_env.env.reward import Outcome, reward_terms
 from ms_slam_env.env.robot_knowledge import STATE_NAMES, RobotKnowledge
 from ms_slam_env.env.saved_state import load_state, save_state
@@ -34,6 +34,12 @@ from ms_slam_env.scenes.base import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences.perturbations.base import Perturbation
 from ms_slam_env.slam.slam_backend import SlamBackend, Views
+
+VIEWS = {
+    "rgb_array": "ms_slam_env.env.rendering:draw_moment",
+    "human": "ms_slam_env.env.rerun_view:EpisodeView",
+}
+"""Name of the option ``render_mode`` to what shows an episode then, imported where it is chosen."""
 
 
 class ActiveSlamEnv(gymnasium.Env[Any, Any]):
@@ -118,7 +124,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     """
 
     metadata = {  # noqa: RUF012 -- Gymnasium declares it as an instance variable
-        "render_modes": ["rgb_array", "human"],
+        "render_modes": [*VIEWS],
         "render_fps": 10,
     }
 
@@ -160,7 +166,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self._observation = make_observation(
             config.observation, self.intrinsics, num_motions, self._actions.num_configurations
         )
-        self.simulation.carves = self._observation.needs_occupancy
+        self.simulation.carves |= self._observation.needs_occupancy
         self._episodes_left = 0  # in the scene that was drawn last
         self.action_space = self._actions.space
         self.observation_space = self._observation.space
@@ -250,9 +256,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         """One picture that explains the moment, (480, 1120, 3) uint8; None in other modes."""
         if self.render_mode != "rgb_array":
             return None
-        return draw_moment(
-            self.episode, self.config.targets, self.slam, self.embodiment, self.scene
-        )
+        shown = self.config.targets, self.slam, self.embodiment, self.scene
+        picture: NDArray[np.uint8] = load_reference(VIEWS["rgb_array"])(self.episode, *shown)
+        return picture
 
     def _observe(self) -> Any:
         """The observation: what the robot itself knows."""
@@ -267,7 +273,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
                     inlier_fraction=episode.inlier_fraction,
                     lost_share=min(1.0, self._lost_share()),
                     motion=episode.action,
-                    motion_mask=self.embodiment.action_masks(),
+                    motion_mask=self.simulation.action_masks(),
                     configuration=self._actions.configuration,
                     lookahead=lambda: self.lookahead() / maxima,
                     here=episode.T_world_camera_estimate,
@@ -367,7 +373,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         (n + K,) where the agent chooses the SLAM configuration too.
         """
         _ = self.episode  # none yet: say so
-        return self._actions.masks(self.embodiment.action_masks())
+        return self._actions.masks(self.simulation.action_masks())
 
     def candidate_poses(self) -> Float64:
         """(n, 4, 4) where each motion would bring the camera, by SLAM's estimate of now."""

@@ -38,6 +38,9 @@ from ms_slam_env.slam.frame_selection import EveryFrameConfig, FrameSelectionCon
 OTHER_OPTIONS = ("embodiment", "render_mode", "task", "max_episode_steps")
 """Options of ``gym.make`` beside the fields of ``EnvConfig``; the last is Gymnasium's own."""
 
+MAP = "map"
+"""Of the option ``mask``: by what the robot knows."""
+
 _OF_STATE = (
     "image_size",
     "field_of_view_deg",
@@ -109,6 +112,10 @@ class EnvConfig(Checked):
         away_patience: steps that the camera may be in submaps that are not joined to the first
             before it ends, lost or not: where it started is known no longer. For SLAM that starts
             no submaps, ``lost_patience`` decides.
+        mask: how ``action_masks`` knows which motions are possible: ``true`` casts them in the true
+            scene from the true pose, ``map`` in the occupancy grid of the robot's own map from the
+            estimated pose. There what was not seen is permitted; a motion that then meets
+            something is not made, as a masked one, and its end is taken for occupied.
         seconds: simulated time after which an episode is truncated; None for the steps alone.
         divergence: how divergence is measured.
         frame_divergences: whether the divergence of every frame from the one before is measured,
@@ -141,6 +148,7 @@ class EnvConfig(Checked):
     frames_per_action: int = bounded(1, 1, 100)
     lost_patience: int = bounded(10, 1, 1_000_000)
     away_patience: int = bounded(50, 1, 1_000_000)
+    mask: str = chosen("true", "true", MAP)
     seconds: float | None = bounded(None, 0.001, 1e9)
     divergence: DivergenceConfig = field(default_factory=DivergenceConfig)
     frame_divergences: bool = True
@@ -150,6 +158,8 @@ class EnvConfig(Checked):
 
     def __post_init__(self) -> None:
         """Refuse unknown choices and values out of range."""
+        if self.mask is True:  # what YAML makes of the name
+            object.__setattr__(self, "mask", "true")
         super().__post_init__()
         _ = self.camera  # refuses a bad size
         if not isinstance(self.noise, str):

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ms_slam_env._runtime.extension import load_reference
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.env.pose_sources import KINEMATIC_SOURCES
 from ms_slam_env.errors import InputError
-from ms_slam_env.robot import Embodiment, FixedTranslation, FreeCamera
+from ms_slam_env.robot import NUM_MOTIONS, Embodiment, FixedTranslation, FreeCamera
 from ms_slam_env.robot.arm import ArmConfig, load_arm
-from ms_slam_env.robot.arm.arm import ArmEmbodiment, KinematicArm
-from ms_slam_env.robot.arm.dynamic_arm import DynamicArm
 from ms_slam_env.scenes.base import Scene
 
 
@@ -28,9 +27,13 @@ class EmbodimentType:
     check: Callable[[EnvConfig], None]
 
 
-def _arm(cls: type[ArmEmbodiment]) -> EmbodimentType:
+def _arm(reference: str) -> EmbodimentType:
+    """An arm, whose planning and physics are imported where there is one."""
+
     def build(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
-        return cls(scene, config.arm, config.step_m, config.step_rad, timings)
+        cls = load_reference(reference)
+        arm: Embodiment = cls(scene, config.arm, config.step_m, config.step_rad, timings)
+        return arm
 
     def check(config: EnvConfig) -> None:  # a bad file is refused before the first reset
         if config.frames_per_action != 1:
@@ -40,7 +43,7 @@ def _arm(cls: type[ArmEmbodiment]) -> EmbodimentType:
             )
         load_arm(config.arm.model, config.arm.camera_site, config.arm.joint_speed_rad_s)
 
-    return EmbodimentType(cls.num_actions, build, check)
+    return EmbodimentType(NUM_MOTIONS, build, check)
 
 
 def _free(cls: type[FreeCamera] | type[FixedTranslation]) -> EmbodimentType:
@@ -60,8 +63,8 @@ def _has_no_arm(config: EnvConfig) -> None:
 
 
 EMBODIMENTS = {
-    "arm": _arm(DynamicArm),
-    "arm-kinematic": _arm(KinematicArm),
+    "arm": _arm("ms_slam_env.robot.arm.dynamic_arm:DynamicArm"),
+    "arm-kinematic": _arm("ms_slam_env.robot.arm.arm:KinematicArm"),
     "free": _free(FreeCamera),
     "fixed-translation": _free(FixedTranslation),
 }

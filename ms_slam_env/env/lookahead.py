@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import cv2
 import numpy as np
 
@@ -9,7 +11,14 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
 from ms_slam_env.env.config import LookaheadConfig
-from ms_slam_env.slam.slam_backend import SlamBackend, Views
+from ms_slam_env.slam.slam_backend import Views
+
+
+class PredictsViews(Protocol):
+    """A map that can be looked at: SLAM, or what a robot sees of it."""
+
+    def predict(self, poses: Float64, scale: float = 1.0) -> Views:
+        """Views from poses (N, 4, 4) at ``scale`` times the camera's size."""
 
 
 class Lookahead:
@@ -28,12 +37,12 @@ class Lookahead:
         self.intrinsics = intrinsics.scaled(config.scale)
         self.measure = make_divergence(divergence, self.intrinsics)
 
-    def predict(self, slam: SlamBackend, poses: Float64) -> Views:
+    def predict(self, slam: PredictsViews, poses: Float64) -> Views:
         """Views of the map from ``poses`` (n, 4, 4), line 5."""
         return slam.predict(poses, self.config.scale)
 
     def divergences(
-        self, slam: SlamBackend, poses: Float64, current_pose: Float64, live: RGBDFrame
+        self, slam: PredictsViews, poses: Float64, current_pose: Float64, live: RGBDFrame
     ) -> Float64:
         """Predicted divergences (n, 2) of the candidates at ``poses`` (n, 4, 4), lines 6 and 7."""
         if self.config.reference == "predicted":

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ms_slam_env._runtime.extension import load_reference
 from ms_slam_env.config import is_options, parse_named
-from ms_slam_env.env.active_slam import ActiveSlamEnv
+from ms_slam_env.env.active_slam import VIEWS, ActiveSlamEnv
 from ms_slam_env.env.config import EnvConfig
-from ms_slam_env.env.rerun_view import EpisodeView
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.sequences.perturbations import FastMotion, make_perturbation
+from ms_slam_env.sequences.perturbations import make_perturbation
 from ms_slam_env.tasks import Task, find_task
 
 _FASTER = 2.0  # of the ids with fast motion, unless their option says otherwise
@@ -24,7 +24,7 @@ def make_env(task: Any = None, perturbed_by: str | None = None, **options: Any) 
     """
     env = _make(task, perturbed_by, **options)
     if env.render_mode == "human":
-        env.make_view = EpisodeView
+        env.make_view = load_reference(VIEWS["human"])
     return env
 
 
@@ -37,7 +37,7 @@ def _make(task: Any, perturbed_by: str | None, **options: Any) -> ActiveSlamEnv:
 
 
 # Gymnasium looks here for the modes before it makes the environment.
-make_env.metadata = {"render_modes": ["rgb_array", "human"]}  # type: ignore[attr-defined]
+make_env.metadata = {"render_modes": [*VIEWS]}  # type: ignore[attr-defined]
 
 
 def _make_for(task: Task, perturbed_by: str | None, **options: Any) -> ActiveSlamEnv:
@@ -86,7 +86,7 @@ def _hurried(strength: Mapping[str, Any], options: Mapping[str, Any]) -> dict[st
             raise unknown("option of fast-motion in an environment", name, ("factor",))
     if options.get("embodiment") not in ("free", "fixed-translation"):
         raise InputError("fast-motion needs a free camera: an arm moves as fast as its joints")
-    factor = FastMotion(factor=strength.get("factor", _FASTER)).factor
+    fast: Any = make_perturbation("fast-motion", {"factor": _FASTER, **strength})
     steps = {name: options.get(name, getattr(EnvConfig, name)) for name in ("step_m", "step_rad")}
     EnvConfig(**steps)  # refuses what is no length
-    return {**options, **{name: factor * step for name, step in steps.items()}}
+    return {**options, **{name: fast.factor * step for name, step in steps.items()}}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.spaces import MultiDiscrete
@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 
 from ms_slam_env._runtime.extension import ExtensionPoint, check_options
 from ms_slam_env.config import parse_named
+from ms_slam_env.env.robot_view import PrivilegedView, RobotView, without_truth
 from ms_slam_env.errors import InputError
-
-if TYPE_CHECKING:
-    from ms_slam_env.env.active_slam import ActiveSlamEnv
 
 RECOVERY = "recovery"
 _OPPOSITE = (0, 2, 1, 4, 3, 6, 5)  # of a translation or rotation, in the paper's order
@@ -29,17 +27,20 @@ kept below 3.2 mm; of 16 that were not, 12 were lost or above 10 mm.
 
 
 class Planner(ABC):
-    """Chooses actions for one environment.
+    """Chooses actions for one robot.
 
-    A planner may use what a robot has: the observation, ``info["action_mask"]`` and the
-    environment's predictions from the map (``lookahead``, ``predict_candidates``,
-    ``candidate_poses``). Ground truth in ``info`` is for evaluation.
+    It knows what the robot does: the observation, ``info`` without the truth (``known``) and its
+    ``robot``. One that needs the truth is a `PrivilegedPlanner`.
 
     Args:
-        env: the unwrapped environment.
+        robot: what it sees; an unwrapped environment is looked at as a `RobotView`.
         seed: of the planner's own random choices; an environment that was reset with the same one
             draws others.
     """
+
+    robot: RobotView
+    view: ClassVar[type[RobotView]] = RobotView
+    """What it is given to see of an environment."""
 
     observation: str = "features"
     """The observation variant that ``act`` expects, unless ``observation_for`` says otherwise."""
@@ -48,10 +49,32 @@ class Planner(ABC):
     motions_only: bool = False
     """Whether it cannot choose a SLAM configuration beside the motion."""
 
-    def __init__(self, env: ActiveSlamEnv, seed: int = 0) -> None:
-        self.env = env
+    def __init__(self, robot: RobotView, seed: int = 0) -> None:
+        self.robot = self.seen_of(robot)
         child = np.random.SeedSequence(seed).spawn(1)[0]  # the environment draws from the parent
         self.rng = np.random.default_rng(child)
+
+    @classmethod
+    def seen_of(cls, env: Any) -> RobotView:
+        """What a planner of this class sees of an unwrapped environment; a view stays as it is.
+
+        Raises:
+            InputError: a view without the truth, of which this planner needs to know.
+        """
+        if isinstance(env, cls.view):
+            return env
+        if isinstance(env, RobotView):
+            raise InputError(f"{cls.__name__} needs the truth, which no {type(env).__name__} has")
+        return cls.view(env)
+
+    @property
+    def env(self) -> Any:
+        """``robot``, by the name that it had before."""
+        return self.robot
+
+    def known(self, info: dict[str, Any]) -> dict[str, Any]:
+        """What ``act`` is to be told of the ``info`` that ``reset`` or ``step`` returned."""
+        return without_truth(info)
 
     @classmethod
     def observation_for(cls, **options: Any) -> str:
@@ -83,6 +106,17 @@ class Planner(ABC):
         """Be told that its last action lost tracking; SLAM holds the pose from before it."""
 
 
+class PrivilegedPlanner(Planner):
+    """Knows the truth: a teacher, or a bound on what there is to gain, and no rival."""
+
+    robot: PrivilegedView
+    view = PrivilegedView
+
+    def known(self, info: dict[str, Any]) -> dict[str, Any]:
+        """All of it."""
+        return info
+
+
 class Recovering(Planner):
     """Undoes the last motions, newest first, while SLAM does not know where it is.
 
@@ -94,8 +128,8 @@ class Recovering(Planner):
     in its way, its rotation alone is undone, or its translation.
     """
 
-    def __init__(self, env: ActiveSlamEnv, planner: Planner) -> None:
-        super().__init__(env)
+    def __init__(self, robot: RobotView, planner: Planner) -> None:
+        super().__init__(robot)
         self.planner = planner
         self._begin()
 
@@ -114,6 +148,10 @@ class Recovering(Planner):
         before = self.made[:-1] if self.has_chosen else [*self.made, self.undoing]
         self.made = [*before, action]
         self.planner.instead(action)
+
+    def known(self, info: dict[str, Any]) -> dict[str, Any]:
+        """What the planner is to be told."""
+        return self.planner.known(info)
 
     def preferences(self) -> NDArray[np.float64] | None:
         """What the planner says; all for the motion that undoes another."""
@@ -136,7 +174,7 @@ class Recovering(Planner):
         self.was_tracked = False
         self.planner.see(observation, info)
         self.undoing = self.made.pop()
-        possible = self.env.action_masks()
+        possible = self.robot.action_masks()
         undone = opposite(self.undoing, possible.size)
         parts = (undone, undone % 7, undone - undone % 7)  # its rotation takes more out of view
         return next((part for part in parts if possible[part]), 0)
@@ -195,8 +233,9 @@ def make_planner(text: str, env: Any, seed: int = 0, **more: Any) -> Planner:
             f"planner {text!r} chooses motions only; this environment asks for a SLAM "
             "configuration too, as random, policy or one of your own chooses it"
         )
-    planner: Planner = cls(env, seed=seed, **options)
-    return Recovering(env, planner) if recovery else planner
+    robot = cls.seen_of(env)
+    planner: Planner = cls(robot, seed=seed, **options)
+    return Recovering(robot, planner) if recovery else planner
 
 
 def planner_observation(text: str) -> str:
@@ -224,7 +263,7 @@ def _parsed(text: str, more: Mapping[str, Any]) -> tuple[type[Planner], dict[str
     name, options = parse_named(text, "planner")
     options = {**options, **more}
     cls: type[Planner] = PLANNERS.find(name)
-    check_options(f"planner {name}", cls, options, ("env", "seed"), (RECOVERY,))
+    check_options(f"planner {name}", cls, options, ("env", "robot", "seed"), (RECOVERY,))
     if not isinstance(options.get(RECOVERY, False), bool):
         raise InputError(f"option {RECOVERY} of planner {name} is true or false")
     return cls, options

@@ -7,13 +7,14 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import Histograms, make_divergence
 from ms_slam_env.env.camera_feed import make_camera_feed
-from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.env.config import MAP, EnvConfig
 from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EmbodimentType
 from ms_slam_env.env.episode import Episode
@@ -82,7 +83,9 @@ class Simulation:
         self._pose_source = POSE_SOURCES[config.pose]()
         self.place: tuple[SceneName, int] | None = None
         self.episode: Episode | None = None
-        self.carves = False
+        self.carves = config.mask == MAP
+        nothing = np.zeros(0, dtype=bool)
+        self._known_mask: tuple[NDArray[np.bool_], Episode | None, int] = nothing, None, 0
         self.fresh_slam = slam.state_like()
 
     # -- The start of an episode -------------------------------------------------------------
@@ -162,9 +165,28 @@ class Simulation:
 
     def move(self, episode: Episode) -> tuple[bool, float]:
         """Make the episode's motion; was it made, and which area (m2) is newly mapped?"""
+        by_map = self.config.mask == MAP
+        may = not by_map or bool(self.action_masks()[episode.action])
+        offset = self.world.embodiment.candidate_motions()[episode.action][:3, 3] if by_map else 0
         with self.timings.stage("move"):
-            motion = self.world.embodiment.move(episode.action)
-        return motion.made, self._track_motion(episode, motion)
+            motion = self.world.embodiment.move(episode.action if may else 0)
+        if by_map and may and not motion.made and np.any(offset):
+            assert episode.occupancy is not None
+            here = episode.T_world_camera_estimate
+            episode.occupancy.touch(here[:3, 3] + here[:3, :3] @ offset)
+        return may and motion.made, self._track_motion(episode, motion)
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """(n,) which motions are possible now, by the truth or by what the robot knows."""
+        robot, episode = self.world.embodiment, self.episode
+        if self.config.mask != MAP or episode is None:
+            return robot.action_masks()
+        known, of, count = self._known_mask
+        if of is not episode or count != len(episode.frames):
+            assert episode.occupancy is not None
+            known = robot.masks_in(episode.occupancy, episode.T_world_camera_estimate)
+            self._known_mask = known, episode, len(episode.frames)
+        return known.copy()
 
     def _track_motion(self, episode: Episode, motion: MotionResult) -> float:
         """Take and track the frames of a motion; return the newly mapped area, m2."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ms_slam_env._runtime.arrays import Float32, Float64, Int64
 from ms_slam_env._runtime.warp import wp
@@ -14,9 +15,11 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.planning.kernels import BLANK, PASSED, STRUCK, count_states, mark_rays
 from ms_slam_env.slam.shared.submap_frames import Submaps
-from ms_slam_env.slam.slam_backend import SlamBackend
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+
+FAR_M = 0.5
+"""Beyond this a grid does not say how far away the next surface is."""
 
 _CHANGE = np.array([0, -1, 3, 0], dtype=np.int8)  # of the log-odds, by mark
 _LIMIT = 9  # of the log-odds: what was wrong for long is unlearned in as many frames
@@ -64,6 +67,26 @@ class OccupancyGrid:
         value = self.log_odds[tuple(cells[inside].T)]
         states[inside] = np.where(value > 0, OCCUPIED, np.where(value < 0, FREE, UNKNOWN))
         return states
+
+    def clearance(self, points: Float64) -> Float64:
+        """Distance (N,) from points (N, 3) to the middle of the nearest occupied cell, metres.
+
+        At most `FAR_M`. What is unknown is in nobody's way.
+        """
+        far = np.full(len(points), FAR_M)
+        low, high = self.cells_of(np.stack([points.min(0) - FAR_M, points.max(0) + FAR_M]))
+        low, high = np.clip([low, high + 1], 0, self.log_odds.shape)
+        occupied = np.argwhere(self.log_odds[tuple(map(slice, low, high))] > 0)
+        if not len(occupied):
+            return far
+        near, _ = cKDTree(self.centres_of(occupied + low)).query(points, distance_upper_bound=FAR_M)
+        return np.asarray(np.minimum(near, far))
+
+    def touch(self, point: Float64) -> None:
+        """Something at a point (3,) was run into: its cell is occupied until it is seen free."""
+        cell = np.floor(point / self.cell_m).astype(np.int64)
+        self._grow(cell, cell + 1)
+        self.log_odds[tuple(cell - self.first)] = _CHANGE[STRUCK]
 
     def integrate(
         self, depth: NDArray[np.float32], T_world_camera: Float64, intrinsics: Intrinsics
@@ -165,6 +188,20 @@ class _Carved(NamedTuple):
     T_world_camera: Float64
 
 
+class HasCorrections(Protocol):
+    """Who knows where SLAM has its frames now: SLAM, or what a robot sees of it."""
+
+    @property
+    def frames_counted(self) -> int:
+        """See ``SlamBackend``."""
+
+    def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
+        """See ``SlamBackend``."""
+
+    def submaps(self) -> Submaps:
+        """See ``SlamBackend``."""
+
+
 class OccupancyMap:
     """Keeps the frames that it was carved from, and carves anew what SLAM has moved.
 
@@ -184,7 +221,7 @@ class OccupancyMap:
 
     def add(
         self,
-        slam: SlamBackend,
+        slam: HasCorrections,
         depth: NDArray[np.float32],
         T_world_camera: Float64,
         intrinsics: Intrinsics,
@@ -203,7 +240,7 @@ class OccupancyMap:
                 self.grid.integrate(frame.depth, frame.T_world_camera, intrinsics)
         self._in_grid = present
 
-    def _follow(self, slam: SlamBackend) -> bool:
+    def _follow(self, slam: HasCorrections) -> bool:
         """Put the frames where SLAM has them now; whether one in the grid has moved by that."""
         numbers, poses = slam.corrected_trajectory()
         now = dict(zip(numbers.tolist(), poses, strict=True))

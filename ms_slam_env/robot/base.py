@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,13 @@ class MotionResult:
         return MotionResult(made, poses, poses.copy(), times_s)
 
 
+class HasClearance(Protocol):
+    """A world of which distances are known: a scene, or a robot's map of it."""
+
+    def clearance(self, points: Float64) -> Float64:
+        """Distance (N,) from points (N, 3) to the nearest surface, 0 inside things."""
+
+
 class Embodiment(ABC):
     """Holds the camera in the world and executes one of ``n`` candidate motions.
 
@@ -86,6 +93,13 @@ class Embodiment(ABC):
     @abstractmethod
     def action_masks(self) -> NDArray[np.bool_]:
         """(n,) whether each motion can be made without touching anything."""
+
+    def masks_in(self, world: HasClearance, T_world_camera: Float64) -> NDArray[np.bool_]:
+        """(n,) the same where the camera is believed to be at a pose (4, 4) of a known ``world``.
+
+        What the carrier knows of itself, as its joints' limits, counts as in ``action_masks``.
+        """
+        return self.action_masks()  # for a carrier whose mask no world changes
 
     @abstractmethod
     def move(self, action: int) -> MotionResult:

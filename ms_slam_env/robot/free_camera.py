@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,11 @@ from ms_slam_env.robot.action_primitives import (
     TRANSLATION_DIRECTIONS,
     decompose,
 )
-from ms_slam_env.robot.base import Embodiment, MotionResult
+from ms_slam_env.robot.base import Embodiment, HasClearance, MotionResult
 from ms_slam_env.scenes.base import Scene, outside, words
 
 CAMERA_RADIUS_M = 0.1  # half the width of an ASUS Xtion (18 cm), rounded up
+_LOOKED_AT_M = 0.05  # between two places of a way in a known world
 
 
 def check_room(scene: Scene, T_world_camera: Float64) -> Float64:
@@ -79,6 +81,17 @@ class FreeCamera(Embodiment):
             free = self.scene.segments_are_free(position, ends, CAMERA_RADIUS_M)
             self._masks = np.repeat([True, *free], NUM_ROTATIONS)
         return self._masks.copy()
+
+    def masks_in(self, world: HasClearance, T_world_camera: Float64) -> NDArray[np.bool_]:
+        """(49,) the same in a known world; a camera that is too near already may go no nearer."""
+        R, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
+        ways = self.step_m * TRANSLATION_DIRECTIONS @ R.T
+        parts = max(1, math.ceil(self.step_m / _LOOKED_AT_M))
+        places = position + np.linspace(0, 1, parts + 1)[:, None, None] * ways
+        room = world.clearance(places.reshape(-1, 3)).reshape(places.shape[:2])
+        needed = CAMERA_RADIUS_M + 0.5 * self.step_m / parts
+        free = (room >= np.minimum(needed, room[0])).all(axis=0)
+        return np.repeat(free, NUM_ROTATIONS)
 
     def move(self, action: int) -> MotionResult:
         """Make motion ``action`` if nothing blocks it."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ms_slam_env._runtime.extension import ExtensionPoint
+from ms_slam_env._runtime.extension import ExtensionPoint, load_reference
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_formats import MESH_SUFFIXES, MeshFile
@@ -28,6 +28,8 @@ _LARGE = {
     name: f"ms_slam_env.scenes.{name}:{name}"
     for name in ("residential_street", "city_street", "factory_hall")
 }
+_MESH_FILE = "ms_slam_env.scenes.mesh_file:from_file"  # where the name is that of a file
+
 POINT = ExtensionPoint(
     "scene", "ms_slam_env.scenes", own={**_ROOMS, **_HOMES, **_LARGE}, form="module:function"
 )
@@ -138,9 +140,8 @@ def make(name: SceneName | Path = "living_room", seed: int = 0) -> Scene:
     key = str(name) if isinstance(name, Path) else name
     check_name(key)
     if is_mesh_file(key):
-        from ms_slam_env.scenes.mesh_file import from_file
-
-        return from_file(str(key), int(seed))
+        read: Callable[[str, int], Scene] = load_reference(_MESH_FILE)
+        return read(str(key), int(seed))
     scene = POINT.find(key)(int(seed))
     if not isinstance(scene, Scene):
         raise InputError(f"scene {name!r} made {type(scene).__name__}, no ms_slam_env.scenes.Scene")

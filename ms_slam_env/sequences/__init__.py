@@ -41,22 +41,26 @@ if TYPE_CHECKING:
     )
     from ms_slam_env.sequences.perturbations import (
         PERTURBATIONS,
+        Perturbation,
+        make_perturbation,
+    )
+    from ms_slam_env.sequences.perturbations.illumination import Illumination
+    from ms_slam_env.sequences.perturbations.images import (
         AutoExposure,
         BlackFrames,
         DepthDropout,
         DepthQuantisation,
         ExposureJumps,
         ExposureRamp,
+    )
+    from ms_slam_env.sequences.perturbations.moving_objects import MovingObjects
+    from ms_slam_env.sequences.perturbations.optics import (
         FastMotion,
         FrameSkipping,
-        Illumination,
         LensDistortion,
         Misregistration,
         MotionBlur,
-        MovingObjects,
-        Perturbation,
         RollingShutter,
-        make_perturbation,
     )
     from ms_slam_env.sequences.rendering import RenderedSequence, render_sequence
     from ms_slam_env.sequences.sequence import Sequence

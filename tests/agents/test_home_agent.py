@@ -48,7 +48,7 @@ def test_where_it_has_been_before_it_goes_to_a_goal_and_then_the_policy_goes_on(
     chosen = []
 
     def before(planner, step):
-        here = planner.env.episode.T_world_camera_estimate
+        here = planner.robot.T_world_camera_estimate
         if step == 2:
             planner.passed.append(here.copy())
         chosen.append(planner.leaves)
@@ -77,7 +77,7 @@ def test_the_policy_chooses_among_the_motions_that_are_not_likely_to_slip():
 
     def before(planner, step):
         if step:
-            here = planner.env.episode.T_world_camera_estimate
+            here = planner.robot.T_world_camera_estimate
             safe.append(planner.safe_motions(here))
             rows = planner.seen[planner.near.policy.metadata.num_state :].reshape(49, -1)
             risks.append(rows[:, GRID_NAMES.index("slip_risk")])

@@ -22,12 +22,12 @@ class Undecided(Planner):
     """Finds the action before the right one a third as good, where that is possible."""
 
     def act(self, observation, info):
-        self.label = self.env.right
+        self.label = self.robot._env.right
         return self.label
 
     def preferences(self):
         before = (self.label - 1) % NUM_ACTIONS
-        other = before if self.env.mask[before] else self.label
+        other = before if self.robot._env.mask[before] else self.label
         return 0.75 * np.eye(NUM_ACTIONS)[self.label] + 0.25 * np.eye(NUM_ACTIONS)[other]
 
 
@@ -37,7 +37,7 @@ class Knowing(Planner):
     instead_of: list = []  # noqa: RUF012 -- the tests look at it
 
     def act(self, observation, info):
-        self.label = self.env.right
+        self.label = self.robot._env.right
         return self.label
 
     def instead(self, action):
@@ -52,7 +52,7 @@ class Through(TrainedPolicy):
 
     def act(self, observation, info):
         action = super().act(observation, info)
-        first = int(np.flatnonzero(self.env.mask)[0])
+        first = int(np.flatnonzero(self.robot._env.mask)[0])
         self.taken.append(first if len(self.taken) % 3 == 2 else action)
         return self.taken[-1]
 

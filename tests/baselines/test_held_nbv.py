@@ -39,8 +39,8 @@ def play(planner_class, steps=6, look=lambda *_: None, **options):
 
 def test_the_best_of_the_admissible_motions_is_taken_and_preferred():
     def look(planner, here, action):
-        motions = planner.env.embodiment.candidate_motions()
-        gain = held_gain(planner.map.grid, here, motions, 6, planner.env.intrinsics)
+        motions = planner.robot.candidate_motions()
+        gain = held_gain(planner.map.grid, here, motions, 6, planner.robot.intrinsics)
         worth = np.where(planner.can, (gain * 0.93 ** np.arange(6)).sum(axis=1), -1)
         assert action == worth.argmax()
         preferred = planner.preferences()

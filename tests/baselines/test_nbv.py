@@ -84,12 +84,12 @@ def test_one_seed_one_episode(episode):
 
 def test_admissible_motions_keep_overlap_and_distance_and_do_not_risk_much(episode):
     planner = episode[2]
-    env = planner.env
+    env = planner.robot
     poses = env.candidate_poses()
     found = planner.admissible(poses)
-    here = env.episode.T_world_camera_estimate
+    here = env.T_world_camera_estimate
     seen_from = np.concatenate([here[None], poses])
-    views = env.slam.predict(seen_from, SCALE)
+    views = env.predict(seen_from, SCALE)
     shares = [((view > 0) & (view < 0.5)).mean() for view in views.depth]
     filled = [(view > 0).mean() for view in views.depth]
     fits = [
@@ -107,9 +107,9 @@ def test_admissible_motions_keep_overlap_and_distance_and_do_not_risk_much(episo
 
 def test_where_no_motion_can_be_followed_all_possible_ones_are_allowed(episode):
     planner = episode[2]
-    poses = planner.env.candidate_poses()
+    poses = planner.robot.candidate_poses()
     before, planner.lost_at = planner.lost_at, poses
-    np.testing.assert_array_equal(planner.admissible(poses), planner.env.action_masks())
+    np.testing.assert_array_equal(planner.admissible(poses), planner.robot.action_masks())
     planner.lost_at = before
 
 
@@ -117,7 +117,7 @@ def test_where_no_motion_can_be_followed_all_possible_ones_are_allowed(episode):
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.05, 0.3, 1.0]), st.sampled_from([0, 3]))
 def test_looking_at_the_best_first_leads_to_the_same_motion(episode, seed, scale, given_up):
     planner, rng = episode[2], np.random.default_rng(seed)
-    poses = planner.env.candidate_poses()
+    poses = planner.robot.candidate_poses()
     score = rng.normal(size=len(poses)).round(1)
     table = np.where(rng.random(len(poses)) < 0.5, scale * rng.random(len(poses)), np.inf)
     asked = []
@@ -138,7 +138,7 @@ def test_looking_at_the_best_first_leads_to_the_same_motion(episode, seed, scale
 
 def test_of_motions_far_apart_only_the_best_are_predicted():
     planner = play(0, 2, step_m=0.3, step_rad=math.radians(24))[2]
-    slam, here = planner.env.slam, planner.env.episode.T_world_camera_estimate
+    slam, here = planner.robot, planner.robot.T_world_camera_estimate
     with patch.object(slam, "predict", wraps=slam.predict) as predict:
         planner.motion_towards(here)
     assert {len(call.args[0]) for call in predict.call_args_list} == {7}
@@ -147,7 +147,7 @@ def test_of_motions_far_apart_only_the_best_are_predicted():
 
 def test_where_tracking_was_lost_it_does_not_go_again(episode):
     planner = episode[2]
-    poses = planner.env.candidate_poses()
+    poses = planner.robot.candidate_poses()
     planner.heading_to = poses[3]
     planner.lost_by(3)
     assert planner.goal is None
@@ -202,7 +202,7 @@ def test_to_slip_is_likelier_near_a_wall_and_by_large_motions():
 def test_options_out_of_range_are_one_line(episode, option):
     name = option.partition("=")[0]
     with pytest.raises(InputError, match=rf"NextBestView\.{name} = .* is outside \["):
-        make_planner(f"nbv,{option}", episode[2].env)
+        make_planner(f"nbv,{option}", episode[2].robot)
 
 
 @pytest.mark.parametrize(
@@ -211,7 +211,7 @@ def test_options_out_of_range_are_one_line(episode, option):
 )
 def test_what_is_counted_takes_no_fractions(episode, planner):
     with pytest.raises(InputError, match=r"\.5 must be an integer"):
-        make_planner(planner, episode[2].env)
+        make_planner(planner, episode[2].robot._env)
 
 
 def test_steps_of_no_length_are_no_division_by_it():
@@ -225,7 +225,7 @@ def test_steps_of_no_length_are_no_division_by_it():
 
 
 def test_options_of_its_goals_are_known_and_others_are_refused(episode):
-    env = episode[2].env
+    env = episode[2].robot
     assert make_planner("nbv,recovery=false,replan=3,risk=0.1", env).replan == 3
     with pytest.raises(InputError, match=r"unknown option of planner nbv 'rish'.*risk.*radius_m"):
         make_planner("nbv,rish=0.1", env)
@@ -243,7 +243,7 @@ def test_distances_are_those_of_each_pose():
 
 def test_goals_are_upright_poses_where_the_camera_can_come_to(episode):
     planner = episode[2]
-    here = planner.env.episode.T_world_camera_estimate
+    here = planner.robot.T_world_camera_estimate
     goals, worth = planner.drawn_goals(here)
     assert len(goals) == len(worth) == planner.goals + planner.goals // 3
     for goal in goals:
@@ -285,7 +285,7 @@ def test_the_way_to_a_goal_behind_a_wall_leads_through_the_door(episode):
 
 def test_a_goal_that_comes_no_nearer_is_given_up_and_more_is_risked(episode):
     planner = episode[2]
-    here = planner.env.episode.T_world_camera_estimate
+    here = planner.robot.T_world_camera_estimate
     planner.goal, planner.way = make_pose(here[:3, :3], here[:3, 3] + 1.0), here[None, :3, 3]
     planner.begun, planner.age, planner.given_up = planner.steps_to_goal(here), 0, 0
     planner.judge_goal(here)
@@ -295,7 +295,7 @@ def test_a_goal_that_comes_no_nearer_is_given_up_and_more_is_risked(episode):
     assert planner.goal is None
     assert planner.given_up == 1
     assert not planner.is_new(goal[None], here).any()
-    poses, risk = planner.env.candidate_poses(), planner.risk
+    poses, risk = planner.robot.candidate_poses(), planner.risk
     planner.risk = 1e-6
     few = planner.admissible(poses)
     planner.given_up = 20
@@ -307,11 +307,11 @@ def test_a_goal_that_comes_no_nearer_is_given_up_and_more_is_risked(episode):
 
 def test_nothing_is_known_beyond_the_reach(episode):
     planner, grids = episode[2], []
-    here = planner.env.episode.T_world_camera_estimate
-    depth = np.full_like(planner.env.episode.last_frame.depth, 3.0)
+    here = planner.robot.T_world_camera_estimate
+    depth = np.full_like(planner.robot.last_frame.depth, 3.0)
     for reach in (2.0, 3.5):
-        near = NextBestView(planner.env, reach_m=reach)
-        near.map.add(planner.env.slam, depth, here, planner.env.intrinsics)
+        near = NextBestView(planner.robot, reach_m=reach)
+        near.map.add(planner.robot, depth, here, planner.robot.intrinsics)
         grids.append(near.map.grid)
     at = (here @ [[0, 0], [0, 0], [1.5, 2.5], [1, 1]])[:3].T
     assert grids[0].states_of(at).tolist() == [FREE, UNKNOWN]

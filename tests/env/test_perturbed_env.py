@@ -21,6 +21,7 @@ from ms_slam_env.sequences import (
     make_perturbation,
     render_sequence,
 )
+from ms_slam_env.sequences.perturbations import POINT
 from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
 
 OPTIONS = {
@@ -270,7 +271,7 @@ def test_ids_can_be_made(env_id) -> None:
     if "FastMotion" in env_id:
         assert env.unwrapped.config.step_m == pytest.approx(0.24)
     else:
-        assert isinstance(perturbations[0], PERTURBATIONS[env.spec.kwargs["perturbed_by"]])
+        assert isinstance(perturbations[0], POINT.find(env.spec.kwargs["perturbed_by"]))
 
 
 @pytest.mark.parametrize("given", [{"step_m": "0.1"}, {"step_rad": None}, {"step_m": -1}])

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
+from ms_slam_env.geometry import invert
 from ms_slam_env.robot.action_primitives import NUM_MOTIONS, decompose
 from ms_slam_env.robot.arm.base_placement import place_arm, reach_m, standing_chain
 from ms_slam_env.robot.arm.clearance import ClearanceField, LinkClearance
@@ -16,7 +17,7 @@ from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.feasibility import LIMIT_MARGIN_RAD, Feasibility, FeasibilityResult
 from ms_slam_env.robot.arm.inverse_kinematics import solve_pose
 from ms_slam_env.robot.arm.model import load_arm
-from ms_slam_env.robot.base import Embodiment, MotionResult
+from ms_slam_env.robot.base import Embodiment, HasClearance, MotionResult
 from ms_slam_env.scenes.base import Scene
 
 
@@ -122,6 +123,18 @@ class ArmEmbodiment(Embodiment):
     def action_masks(self) -> NDArray[np.bool_]:
         """(49,) whether the arm reaches each target on a straight line without touching."""
         return self.probe().ok.copy()
+
+    def masks_in(self, world: HasClearance, T_world_camera: Float64) -> NDArray[np.bool_]:
+        """(49,) the same in a known world, in which the camera says where the arm stands."""
+        with self.timings.stage("mask"):
+            q, T_base_camera = self.planning_state()
+            T_world_base = T_world_camera @ invert(T_base_camera)
+            known = ClearanceField(world, T_world_base, reach_m(self.chain))
+            return (
+                Feasibility(self.chain, known, self.config)
+                .probe(q, T_base_camera @ self.motions)
+                .ok
+            )
 
     def get_state(self) -> dict[str, Any]:
         """Where the arm stands and its joint angles; the rest follows from them."""

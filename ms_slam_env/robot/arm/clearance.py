@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import mink
 import numpy as np
 from numpy.typing import NDArray
@@ -11,18 +9,12 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
+from ms_slam_env.robot.base import HasClearance
 from ms_slam_env.scenes.free_space import trilinear
 from ms_slam_env.scenes.mesh_scene import MeshScene
 
 _VOXEL_M = 0.05
 _SLACK = 0.5  # of a voxel
-
-
-class HasClearance(Protocol):
-    """A world of which distances are known."""
-
-    def clearance(self, points: Float64) -> Float64:
-        """Distance (N,) from points (N, 3) to the nearest surface, 0 inside things."""
 
 
 class ClearanceField:

@@ -11,44 +11,28 @@ from typing import Any
 from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env.config import from_dict
 from ms_slam_env.sequences.perturbations.base import Moment, Perturbation
-from ms_slam_env.sequences.perturbations.illumination import Illumination
-from ms_slam_env.sequences.perturbations.images import (
-    AutoExposure,
-    BlackFrames,
-    DepthDropout,
-    DepthQuantisation,
-    ExposureJumps,
-    ExposureRamp,
-)
-from ms_slam_env.sequences.perturbations.moving_objects import MovingObjects
-from ms_slam_env.sequences.perturbations.optics import (
-    FastMotion,
-    FrameSkipping,
-    LensDistortion,
-    Misregistration,
-    MotionBlur,
-    RollingShutter,
-)
 
 __all__ = ["PERTURBATIONS", "Moment", "Perturbation", "make_perturbation"]
 
-PERTURBATIONS: dict[str, type[Perturbation]] = {
-    "rolling-shutter": RollingShutter,
-    "motion-blur": MotionBlur,
-    "misregistration": Misregistration,
-    "lens-distortion": LensDistortion,
-    "exposure-ramp": ExposureRamp,
-    "exposure-jumps": ExposureJumps,
-    "auto-exposure": AutoExposure,
-    "black-frames": BlackFrames,
-    "depth-dropout": DepthDropout,
-    "depth-quantisation": DepthQuantisation,
-    "frame-skipping": FrameSkipping,
-    "moving-objects": MovingObjects,
-    "fast-motion": FastMotion,
-    "illumination": Illumination,
+_OWN = __name__
+
+PERTURBATIONS: dict[str, str] = {
+    "rolling-shutter": f"{_OWN}.optics:RollingShutter",
+    "motion-blur": f"{_OWN}.optics:MotionBlur",
+    "misregistration": f"{_OWN}.optics:Misregistration",
+    "lens-distortion": f"{_OWN}.optics:LensDistortion",
+    "exposure-ramp": f"{_OWN}.images:ExposureRamp",
+    "exposure-jumps": f"{_OWN}.images:ExposureJumps",
+    "auto-exposure": f"{_OWN}.images:AutoExposure",
+    "black-frames": f"{_OWN}.images:BlackFrames",
+    "depth-dropout": f"{_OWN}.images:DepthDropout",
+    "depth-quantisation": f"{_OWN}.images:DepthQuantisation",
+    "frame-skipping": f"{_OWN}.optics:FrameSkipping",
+    "moving-objects": f"{_OWN}.moving_objects:MovingObjects",
+    "fast-motion": f"{_OWN}.optics:FastMotion",
+    "illumination": f"{_OWN}.illumination:Illumination",
 }
-"""Name to class."""
+"""Name to where its class is, which is imported where it is made."""
 
 POINT = ExtensionPoint("perturbation", "ms_slam_env.perturbations", Perturbation, own=PERTURBATIONS)
 """Where perturbations are found."""

@@ -13,7 +13,7 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import RayCaster
-from ms_slam_env.scenes.movers import Shape
+from ms_slam_env.scenes.movers.shape import Shape
 from ms_slam_env.sensor import ChangingLight
 from ms_slam_env.sequences.perturbations.base import LightPerturbation, random_numbers
 from ms_slam_env.sequences.perturbations.movers import Track
