@@ -116,6 +116,15 @@ def test_two_envs_with_one_seed_agree_to_the_bit(env_id, options):
         assert_same(a.step(action), b.step(action))
 
 
+def test_at_one_place_another_seed_is_another_noise():
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", observation="rgbd", image_size="64x48", **OPTIONS)
+    _, info = env.reset(seed=0)
+    here = {"T_world_camera": info["T_world_camera"]}
+    first, other, again = (env.reset(seed=seed, options=here)[0] for seed in (0, 1, 0))
+    assert_same(again, first)
+    assert (other["depth"] != first["depth"]).any()
+
+
 def test_episodes_in_a_row_are_in_one_scene_until_a_seed_draws_another():
     options = {"scene": ("table", "wall"), "num_scene_seeds": 3, "episodes_per_scene": 2}
     env = gym.make("MSActiveSLAM-FreeCamera-v0", **options)
@@ -347,12 +356,16 @@ def test_lookahead_predicts_every_candidate(reference):
         assert predicted[1:].max() > 0
 
 
-def test_black_frames_end_the_episode_as_lost(env, monkeypatch):
+def test_black_frames_in_a_row_end_the_episode_as_lost(env, monkeypatch):
     env.reset(seed=0)
     frame = env.unwrapped.episode.last_frame
     black = type(frame)(np.zeros_like(frame.color), np.zeros_like(frame.depth), 0.0)
-    monkeypatch.setattr(type(env.unwrapped.sensor), "capture", lambda *_, **__: black)
     patience = env.unwrapped.config.lost_patience
+    with monkeypatch.context() as dark:
+        dark.setattr(type(env.unwrapped.sensor), "capture", lambda *_, **__: black)
+        assert not any(env.step(0)[2] for _ in range(patience - 1))
+    assert env.step(0)[4]["tracking_ok"]  # and the count begins anew
+    monkeypatch.setattr(type(env.unwrapped.sensor), "capture", lambda *_, **__: black)
     for step in range(1, patience + 1):
         _, _, terminated, _, info = env.step(1)
         assert not info["tracking_ok"]
