@@ -176,11 +176,12 @@ def test_what_is_no_mesh_inside_a_mesh_file_is_refused(tmp_path, read):
     """trimesh takes faces of vertices that are not there, and vertices of one number."""
     data = trimesh.creation.box().export(file_type="ply")
     first_face = data.index(b"end_header") + len(b"end_header\n") + 8 * 12 + 1
-    (tmp_path / "a.ply").write_bytes(
-        data[:first_face] + (2**30).to_bytes(4, "little") + data[first_face + 4 :]
-    )
-    with pytest.raises(InputError, match=r"a face has a vertex beyond the 8 that|is out of bounds"):
-        read(tmp_path / "a.ply")
+    for vertex in (2**30, 8, -1):
+        there = vertex.to_bytes(4, "little", signed=True)
+        (tmp_path / "a.ply").write_bytes(data[:first_face] + there + data[first_face + 4 :])
+        said = r"a face has a vertex beyond the 8 that|is out of bounds"
+        with pytest.raises(InputError, match=said):
+            read(tmp_path / "a.ply")
     (tmp_path / "b.obj").write_text("v -1.0000")
     with pytest.raises(InputError, match=r"b\.obj"):
         read(tmp_path / "b.obj")
