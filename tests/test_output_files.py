@@ -96,6 +96,24 @@ def test_what_does_not_fit_leaves_what_was(
     assert path.read_text() == ("" if is_new else "first line\n") + "fits\n"
 
 
+def test_a_file_is_on_disk_before_it_takes_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a power cut may leave a file of the new name and no content."""
+    done: list[str] = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(output_files.os, "fsync", lambda *to: (done.append("sync"), fsync(*to)))
+    monkeypatch.setattr(output_files.os, "replace", lambda *to: (done.append("to"), replace(*to)))
+    for write, expected in (
+        (lambda path: write_bytes(path, b"x"), ["sync", "to"]),
+        (lambda path: write_bytes(path, b"x", durable=False), ["to"]),
+        (lambda path: append_line(path, b"x\n"), ["sync"]),
+    ):
+        done.clear()
+        write(tmp_path / "a")
+        assert done == expected
+
+
 @pytest.mark.parametrize("length", [1, 65535, 65536, 70000, 200_000])
 def test_a_torn_last_line_is_removed_however_long(tmp_path: Path, length: int) -> None:
     path = tmp_path / "a.jsonl"

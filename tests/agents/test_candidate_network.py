@@ -11,8 +11,7 @@ pytest.importorskip("sb3_contrib")
 from ms_slam_agents import options, ppo
 from ms_slam_agents.network import Network
 from ms_slam_agents.normalization import PooledMoments
-from ms_slam_agents.policy import Policy
-from ms_slam_agents.policy_file import Metadata, read_policy, write_policy
+from ms_slam_agents.policy_file import Metadata, read_policy
 
 from ms_slam_env.errors import InputError
 
@@ -76,25 +75,6 @@ def test_what_is_dropped_is_dropped_while_it_trains_alone(numbers):
     torch.testing.assert_close(layers[~dropped], 2 * known[~dropped])
     assert len(trained.unique(dim=0)) > 100
     assert len(network(seen, memory, can)[0].unique(dim=0)) == 1
-
-
-@pytest.mark.parametrize("memory", [0, 8])
-def test_the_policy_in_numpy_is_the_network_and_is_read_back(memory, tmp_path):
-    network = make_network(memory)
-    write_policy(tmp_path / "policy.safetensors", file_of(network, memory))
-    policy = Policy.load(tmp_path / "policy.safetensors")
-    rng = np.random.default_rng(0)
-    own, theirs = policy.empty_memory(4), torch.zeros(4, memory)
-    for _ in range(4):
-        seen, masks = rng.normal(size=(4, INPUTS)), rng.random((4, ACTIONS)) < 0.6
-        masks[:, 0] = True
-        own = policy.remember(seen, own)
-        scaled = torch.as_tensor((seen - 0.5) / 2, dtype=torch.float32)
-        with torch.no_grad():
-            theirs = network.remember(scaled, theirs, torch.zeros(4))
-            expected = network(scaled, theirs, torch.as_tensor(masks))[0].exp().numpy()
-        np.testing.assert_allclose(policy.probabilities(seen, masks, own), expected, atol=1e-5)
-    assert expected.max() > 1.5 / ACTIONS
 
 
 def test_the_order_of_the_candidates_means_nothing():

@@ -1,10 +1,10 @@
 """The policy near by, goals beyond: which of the two chooses each motion."""
 
-import gymnasium as gym
 import pytest
 from ms_slam_agents.home_agent import HomeAgent, HomePolicy
 from ms_slam_agents.policy_planner import SHIPPED
 from ms_slam_baselines.nbv import NextBestView
+from small_env import ROOM, small_env
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.env.planners import make_planner, planner_observation
@@ -12,14 +12,9 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.planning.candidates import GRID_NAMES
 
 
-def make_env():
-    options = {"scene": "table", "scene_seed": 0, "image_size": "80x60", "observation": "held"}
-    return gym.make("MSActiveSLAM-Room-v0", disable_env_checker=True, **options)
-
-
 def play(planner_class, steps=8, before=lambda *_: None, **options):
     """Actions of a planner and whether it was on the way to a goal."""
-    env = make_env()
+    env = small_env(ROOM, observation="held")
     observation, info = env.reset(seed=0)
     planner = planner_class(env.unwrapped, seed=1, **options)
     planner.reset()
@@ -62,7 +57,7 @@ def test_where_it_has_been_before_it_goes_to_a_goal_and_then_the_policy_goes_on(
 
 
 def test_the_motion_that_lost_tracking_is_not_made_again():
-    env = make_env()
+    env = small_env(ROOM, observation="held")
     observation, info = env.reset(seed=0)
     planner = HomeAgent(env.unwrapped, seed=1, enough_m3=0.0)
     wanted = planner.act(observation, info)
@@ -89,14 +84,13 @@ def test_the_policy_chooses_among_the_motions_that_are_not_likely_to_slip():
 
 
 def test_a_policy_that_is_not_shown_the_risks_is_refused():
-    env = gym.make("MSActiveSLAM-Room-v0", scene="table", image_size="80x60",
-                   observation="candidates", disable_env_checker=True).unwrapped  # fmt: skip
+    env = small_env(ROOM, observation="candidates").unwrapped
     with pytest.raises(InputError, match=r"agent-home.*'candidates'; valid choices: goals, held"):
         HomeAgent(env, path=str(SHIPPED / "paper.safetensors"))
 
 
 def test_it_is_found_by_its_name_with_options_and_the_observation_of_its_policy():
-    env = make_env().unwrapped
+    env = small_env(ROOM, observation="held").unwrapped
     assert planner_observation("agent-home") == "held"
     planner = make_planner("agent-home,enough_m3=0.5", env)
     assert planner.planner.enough_m3 == pytest.approx(0.5)

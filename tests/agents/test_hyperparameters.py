@@ -191,14 +191,6 @@ def test_a_run_keeps_the_terms_that_it_leaves_out(tmp_path):
         resume.check_kept(tmp_path, {}, args, ["without"])
 
 
-@pytest.mark.parametrize("trainer", TRAINERS)
-def test_an_observation_of_several_parts_is_refused(trainer, tmp_path, capsys):
-    main = {"ppo": ppo, "imitation": imitation, "sb3": train_sb3, "qrdqn": qrdqn}[trainer].main
-    assert main(["--observation", "rgbd", "--out", str(tmp_path / "run")]) == 2
-    assert "observation 'rgbd' has several parts" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
 def test_the_parallel_environments_are_of_several_tasks_in_turn(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("problem: {scenes: [wall], episode_steps: 7}\nppo: {gamma: 0.5}\n")

@@ -13,7 +13,7 @@ pytest.importorskip("sb3_contrib")
 from ms_slam_agents import options, ppo, qrdqn
 from ms_slam_agents.network import Network, load_parameters
 from ms_slam_agents.policy import Policy
-from ms_slam_agents.policy_file import Metadata, image_width, read_policy, write_policy
+from ms_slam_agents.policy_file import Metadata, image_width, read_policy
 
 from ms_slam_env.errors import InputError
 
@@ -61,26 +61,6 @@ def file_of(network, memory=0):
         image=IMAGE,
     )
     return with_moments(network, metadata)
-
-
-@pytest.mark.parametrize("memory", [0, 6])
-def test_the_policy_in_numpy_is_the_network_and_is_read_back(memory, tmp_path):
-    network = make_network(memory)
-    write_policy(tmp_path / "policy.safetensors", file_of(network, memory))
-    policy = Policy.load(tmp_path / "policy.safetensors")
-    assert policy.metadata.image == IMAGE
-    rng = np.random.default_rng(0)
-    own, theirs = policy.empty_memory(4), torch.zeros(4, memory)
-    for _ in range(3):
-        seen, masks = rng.normal(size=(4, INPUTS)), rng.random((4, NUM_ACTIONS)) < 0.6
-        masks[:, 0] = True
-        own = policy.remember(seen, own)
-        scaled = torch.as_tensor((seen - 0.5) / 2, dtype=torch.float32)
-        with torch.no_grad():
-            theirs = network.remember(scaled, theirs, torch.zeros(4))
-            expected = network(scaled, theirs, torch.as_tensor(masks))[0].exp().numpy()
-        np.testing.assert_allclose(policy.probabilities(seen, masks, own), expected, atol=1e-5)
-    assert expected.max() > 1.5 / NUM_ACTIONS
 
 
 @pytest.mark.parametrize("image", [(1, 17, 17), (4, 30, 40), (3, 19, 18), (2, 16, 30)])

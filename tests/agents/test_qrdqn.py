@@ -247,14 +247,6 @@ def test_a_run_goes_on_with_its_count_and_a_new_replay(tmp_path, capsys):
     assert "trained with quantiles 5, not 6" in capsys.readouterr().err
 
 
-def test_two_runs_of_one_seed_are_one(tmp_path):
-    for name in "ab":
-        assert qrdqn.main(words(tmp_path / name)) == 0
-    a, b = (read_policy(tmp_path / name / "latest.safetensors").tensors for name in "ab")
-    for name, value in a.items():
-        np.testing.assert_array_equal(b[name], value, err_msg=name)
-
-
 def test_quantiles_that_no_network_has_are_refused():
     whole = ("qr_dqn", ENV_ID, "features", 4, (16, 16), (3,), 4, 1, 0.0)
     with pytest.raises(InputError, match="quantiles = -1"):

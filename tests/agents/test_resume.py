@@ -6,12 +6,14 @@ import json
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("sb3_contrib")
 
 from learnable_fake import read_curve, words_of
 from ms_slam_agents import imitation, learning_curve, ppo, qrdqn, resume, train_sb3
+from ms_slam_agents.policy_file import read_policy
 from policy_files import METADATA, as_bytes
 
 from ms_slam_env.report.records import to_plain
@@ -181,20 +183,41 @@ def points(out):
     return [(p["timesteps"], p["return"]) for p in read_curve(out).points]
 
 
-@pytest.mark.parametrize("trainer", ["ppo", "qrdqn", "sb3"])
+LEARNS = {
+    "sb3": {"n_steps": 16, "n_epochs": 2},
+    "ppo": {"n_steps": 16, "n_epochs": 2, "memory": 4},
+    "qrdqn": {"save_every": 16, "learning_starts": 16, "train_every": 1},
+}
+
+
+def train(trainer, out):
+    judged = {"total_timesteps": 64, "eval_every": 32, "eval_episodes": 3}
+    more = words_of(out, ["--no-references"], **judged | LEARNS[trainer])
+    return TRAINERS[trainer][0].main(more)
+
+
+@pytest.fixture(scope="module", params=LEARNS)
+def whole(request, tmp_path_factory):
+    """A trainer, and the folder of a run of it that nothing interrupted."""
+    out = tmp_path_factory.mktemp(request.param)
+    assert train(request.param, out) == 0
+    assert [steps for steps, _ in points(out)] == [0, 32, 64]
+    return request.param, out
+
+
+def test_two_runs_of_one_seed_are_one(whole, tmp_path):
+    trainer, out = whole
+    assert train(trainer, tmp_path) == 0
+    assert points(tmp_path) == points(out)
+    a, b = (read_policy(path / "latest.safetensors").tensors for path in (out, tmp_path))
+    for name, value in a.items():
+        np.testing.assert_array_equal(b[name], value, err_msg=name)
+
+
 @pytest.mark.parametrize("at", [0, 1, 2])
-def test_a_point_that_a_kill_prevented_is_made_up(trainer, at, tmp_path, monkeypatch):
+def test_a_point_that_a_kill_prevented_is_made_up(whole, at, tmp_path, monkeypatch):
     """Killed between saving and evaluating: at first, in the midst, and at the end."""
-    module = TRAINERS[trainer][0]
-    learns = {
-        "sb3": {"n_steps": 16, "n_epochs": 2},
-        "ppo": {"n_steps": 16, "n_epochs": 2},
-        "qrdqn": {"save_every": 16, "learning_starts": 16, "train_every": 1},
-    }[trainer]
-    more = {"total_timesteps": 64, "eval_every": 32, "eval_episodes": 3, **learns}
-    words = words_of(tmp_path / "whole", ["--no-references"], **more)
-    assert module.main(words) == 0
-    assert [steps for steps, _ in points(tmp_path / "whole")] == [0, 32, 64]
+    trainer, out = whole
     played = learning_curve.evaluate_policy
     with monkeypatch.context() as patched:
         left = [played] * at
@@ -206,11 +229,12 @@ def test_a_point_that_a_kill_prevented_is_made_up(trainer, at, tmp_path, monkeyp
 
         patched.setattr(learning_curve, "evaluate_policy", play)
         with pytest.raises(Killed):
-            module.main(words_of(tmp_path / "killed", ["--no-references"], **more))
-    assert module.main(["--out", str(tmp_path / "killed"), "--resume"]) == 0
-    assert [steps for steps, _ in points(tmp_path / "killed")] == [0, 32, 64]
-    assert points(tmp_path / "killed")[: at + 1] == points(tmp_path / "whole")[: at + 1]
-    assert module.main(["--out", str(tmp_path / "killed"), "--resume"]) == 2  # all is there
+            train(trainer, tmp_path)
+    again = ["--out", str(tmp_path), "--resume"]
+    assert TRAINERS[trainer][0].main(again) == 0
+    assert [steps for steps, _ in points(tmp_path)] == [0, 32, 64]
+    assert points(tmp_path)[: at + 1] == points(out)[: at + 1]
+    assert TRAINERS[trainer][0].main(again) == 2  # all is there
 
 
 def test_a_round_that_is_judged_twice_has_one_point():

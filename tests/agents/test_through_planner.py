@@ -1,6 +1,5 @@
 """Learning within a planner: what it leaves open, and that the rest teaches nothing."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -9,6 +8,7 @@ from ms_slam_agents.environments import VALIDATION_SEED, make_venv
 from ms_slam_agents.home_agent import HomePolicy
 from ms_slam_agents.network import Network
 from ms_slam_agents.through_planner import ThroughPlanner
+from small_env import ROOM, small_env
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.env.planners import make_planner
@@ -18,8 +18,7 @@ AGENT = "agent-home"
 
 
 def make_env(observation="held"):
-    options = {"scene": "table", "scene_seed": 0, "image_size": "80x60", "observation": observation}
-    return gym.make("MSActiveSLAM-Room-v0", disable_env_checker=True, **options)
+    return small_env(ROOM, observation=observation)
 
 
 def play(env, choose, steps=30):

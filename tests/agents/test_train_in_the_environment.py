@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("sb3_contrib")
 
-from ms_slam_agents import environments, imitation, ppo, train_sb3
+from ms_slam_agents import environments, train_sb3
 from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_planner import TrainedPolicy
 
@@ -47,27 +47,6 @@ def test_two_processes_train_a_policy_that_plans(tmp_path):
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        (("--scenes", "mars"), "unknown scene 'mars'; valid choices: living_room"),
-        (
-            ("--env-id", "Mars-v0"),
-            "unknown environment 'Mars-v0'; valid choices: MSA",
-        ),
-        (("--step-m", "7"), "step_m = 7.0 is outside"),
-        (("--scene-seeds", "1000"), "EnvConfig.num_scene_seeds = 1000 is outside"),  # validation's
-    ],
-)
-@pytest.mark.parametrize("trainer", [imitation, ppo, train_sb3])
-def test_bad_options_of_the_environment_give_one_line(tmp_path, capsys, option, message, trainer):
-    assert trainer.main(["--out", str(tmp_path / "run"), *option]) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert len(error.strip().splitlines()) == 1
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_policy_with_the_defaults_fits_the_environment_with_the_defaults():
     """The observation of training is the one that an environment has if nobody says another."""
     args = train_sb3.Args(scenes=("table",), scene_seeds=1)
@@ -81,11 +60,9 @@ def test_a_policy_with_the_defaults_fits_the_environment_with_the_defaults():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["maskable_ppo", "ppo"])
-def test_motion_and_slam_configuration_are_learnt_together(tmp_path, algorithm):
+def test_motion_and_slam_configuration_are_learnt_together(tmp_path):
     options = {
         "out": tmp_path / "run",
-        "algorithm": algorithm,
         "env-id": "MSActiveSLAM-Adaptive-v0",
         "embodiment": "free",
         "observation": "features",

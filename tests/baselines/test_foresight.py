@@ -1,10 +1,10 @@
 """Motions tried and taken back: their rewards are those of the steps, and nothing has changed."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from ms_slam_baselines.foresight import Foresight
 from ms_slam_baselines.greedy import GreedyDivergence, distance_to_targets
+from small_env import small_env
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.env.config import TargetConfig
@@ -12,17 +12,6 @@ from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
 
 TARGETS = TargetConfig()
-
-
-def make_env(env_id="MSActiveSLAM-FreeCamera-v0", **options):
-    return gym.make(
-        env_id,
-        scene="table",
-        scene_seed=0,
-        image_size="80x60",
-        disable_env_checker=True,
-        **options,
-    )
 
 
 @pytest.mark.parametrize(
@@ -34,7 +23,7 @@ def make_env(env_id="MSActiveSLAM-FreeCamera-v0", **options):
     ],
 )
 def test_what_is_foreseen_is_what_comes_and_nothing_has_changed(env_id, options):
-    env, other = make_env(env_id, **options), make_env(env_id, **options)
+    env, other = small_env(env_id, **options), small_env(env_id, **options)
     for one in (env, other):
         one.reset(seed=3)
         one.step(one.unwrapped.action_space.sample() * 0)
@@ -53,18 +42,18 @@ def test_what_is_foreseen_is_what_comes_and_nothing_has_changed(env_id, options)
 
 
 def test_a_motion_that_there_is_not_changes_nothing():
-    env, other = make_env(), make_env()
+    env, other = small_env(), small_env()
     for one in (env, other):
         one.reset(seed=3)
     with pytest.raises(InputError, match="49"):
         env.unwrapped.foresee([3, 49])
     np.testing.assert_array_equal(env.step(3)[0], other.step(3)[0])
     with pytest.raises(InputError, match="reset"):
-        make_env().unwrapped.foresee([0])
+        small_env().unwrapped.foresee([0])
 
 
 def test_the_best_of_those_tried_is_made_and_preferred():
-    env = make_env(reward="paper")
+    env = small_env(reward="paper")
     observation, info = env.reset(seed=3)
     planner = Foresight(env.unwrapped, seed=1, tried=6)
     action = planner.act(observation, info)
@@ -80,7 +69,7 @@ def test_the_best_of_those_tried_is_made_and_preferred():
 
 
 def test_in_greedys_order_those_are_tried_that_greedy_ranks_first():
-    env = make_env(reward="paper")
+    env = small_env(reward="paper")
     observation, info = env.reset(seed=3)
     greedy = GreedyDivergence(env.unwrapped)
     possible = np.flatnonzero(info["action_mask"])
@@ -93,7 +82,7 @@ def test_in_greedys_order_those_are_tried_that_greedy_ranks_first():
 
 
 def test_only_an_error_that_is_no_noise_counts(monkeypatch):
-    env = make_env(reward="paper")
+    env = small_env(reward="paper")
     observation, info = env.reset(seed=3)
     terms = [
         {"depth_divergence": -0.02, "trajectory_error": 0.01},
@@ -110,7 +99,7 @@ def test_only_an_error_that_is_no_noise_counts(monkeypatch):
 
 
 def test_terms_left_out_do_not_count():
-    env = make_env()
+    env = small_env()
     observation, info = env.reset(seed=3)
     tried = np.flatnonzero(info["action_mask"])
     terms = env.unwrapped.foresee_terms(tried)
@@ -125,7 +114,7 @@ def test_terms_left_out_do_not_count():
 
 
 def test_it_is_found_by_its_name_and_refuses_what_it_cannot():
-    env = make_env().unwrapped
+    env = small_env().unwrapped
     assert isinstance(make_planner("foresight,tried=3", env), Foresight)
     assert make_planner("foresight,without=", env).without == ()
     for option in ("tried=0", "temperature=0", "noise=-1", "order=greediest"):

@@ -1,10 +1,10 @@
 """Motions that are held: what they are worth, which is taken, and what is said of the others."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from ms_slam_baselines.held_nbv import HeldNextBestView
 from ms_slam_baselines.nbv import NextBestView
+from small_env import ROOM, small_env
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.env.planners import make_planner
@@ -12,19 +12,9 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.planning import held_gain
 
 
-def make_env():
-    return gym.make(
-        "MSActiveSLAM-Room-v0",
-        scene="table",
-        scene_seed=0,
-        image_size="80x60",
-        disable_env_checker=True,
-    )
-
-
 def play(planner_class, steps=6, look=lambda *_: None, **options):
     """The actions of a planner, looked at after each of them."""
-    env = make_env()
+    env = small_env(ROOM)
     observation, info = env.reset(seed=0)
     planner = planner_class(env.unwrapped, seed=1, **options)
     planner.reset()
@@ -78,7 +68,7 @@ def test_a_motion_is_worth_less_by_what_its_risk_to_slip_costs():
 
 
 def test_it_is_found_by_its_name_says_what_it_prefers_and_refuses_what_it_cannot():
-    env = make_env()
+    env = small_env(ROOM)
     planner = make_planner("held-nbv,horizon=3", env.unwrapped)
     assert planner.planner.horizon == 3
     observation, info = env.reset(seed=0)
@@ -93,7 +83,7 @@ def test_it_is_found_by_its_name_says_what_it_prefers_and_refuses_what_it_cannot
 
 
 def test_where_held_motions_lead_back_it_goes_to_a_goal_until_it_is_reached():
-    env = make_env()
+    env = small_env(ROOM)
     observation, info = env.reset(seed=0)
     planner = HeldNextBestView(env.unwrapped, seed=1)
     planner.reset()

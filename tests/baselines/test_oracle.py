@@ -1,8 +1,8 @@
 """The oracle sees what the sensor sees, counts what is mapped, and knows better than `held-nbv`."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from small_env import ROOM, small_env
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.env.planners import make_planner
@@ -14,13 +14,7 @@ from ms_slam_env.geometry import invert, transform_points
 @pytest.fixture(scope="module")
 def start():
     """An oracle after its first decision, the view from its start and the world."""
-    env = gym.make(
-        "MSActiveSLAM-Room-v0",
-        scene="table",
-        scene_seed=0,
-        image_size="160x120",
-        disable_env_checker=True,
-    )
+    env = small_env(ROOM, image_size="160x120")
     observation, info = env.reset(seed=0)
     planner = make_planner("oracle", env.unwrapped)
     planner.reset()

@@ -116,12 +116,6 @@ def test_greedy_takes_its_targets_from_the_environment():
         assert act(GreedyDivergence(env)) == [slow_algorithm_1(env, 0.9, 0.1, 3.0)]
 
 
-def test_greedy_with_targets_of_zero_stands_still():
-    env = FakeEnv()
-    env.divergences[0] = 0
-    assert act(GreedyDivergence(env, rho_I=0, rho_D=0), 3) == [0] * 3
-
-
 def test_greedy_breaks_ties_by_the_lowest_action():
     env = FakeEnv()
     env.divergences[:] = 0.01

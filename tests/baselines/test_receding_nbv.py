@@ -1,10 +1,10 @@
 """The receding horizon: the best goal anew after every motion, far goals as `nbv` has them."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from ms_slam_baselines.nbv import NextBestView
 from ms_slam_baselines.receding_nbv import RecedingNextBestView
+from small_env import ROOM, small_env
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.env.planners import make_planner
@@ -13,13 +13,7 @@ from ms_slam_env.planning.view_goals import best_goal
 
 def played(planner_class, steps=6, **options):
     """Planner and environment after some steps, the actions and the goals."""
-    env = gym.make(
-        "MSActiveSLAM-Room-v0",
-        scene="table",
-        scene_seed=0,
-        image_size="80x60",
-        disable_env_checker=True,
-    )
+    env = small_env(ROOM)
     observation, info = env.reset(seed=0)
     planner = planner_class(env.unwrapped, seed=1, **options)
     planner.reset()
@@ -55,13 +49,7 @@ def test_where_no_view_near_by_gains_enough_it_is_nbv():
 
 
 def test_it_is_found_by_its_name_and_goes_back_when_lost():
-    env = gym.make(
-        "MSActiveSLAM-Room-v0",
-        scene="table",
-        scene_seed=0,
-        image_size="80x60",
-        disable_env_checker=True,
-    ).unwrapped
+    env = small_env(ROOM).unwrapped
     planner = make_planner("receding-nbv,enough_m3=0.5", env)
     assert isinstance(planner.planner, RecedingNextBestView)
     assert planner.planner.enough_m3 == pytest.approx(0.5)

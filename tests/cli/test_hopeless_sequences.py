@@ -1,6 +1,8 @@
 """Commands over several sequences say so where one shows nothing or is lost from end to end."""
 
 import json
+import re
+import shutil
 
 import numpy as np
 import pytest
@@ -50,6 +52,7 @@ def jumping(recording):
 
 
 COMMANDS = {
+    "run": "run {} --backend odometry",
     "compare": "compare --sequences {} --backends odometry --image-sizes 80x60 --workers 1",
     "explore": "explore --sequences {} --parameters keyframe_deg=0:20 --config {config} "
     "--image-size 80x60 --trials 2",
@@ -58,11 +61,17 @@ COMMANDS = {
 
 def run(command, folder, tmp_path):
     (tmp_path / "c.yaml").write_text("slam: odometry\n")
-    words = COMMANDS[command].format(folder, config=tmp_path / "c.yaml").split()
+    words = (
+        {**COMMANDS, "divergence": "divergence {}"}[command]
+        .format(folder, config=tmp_path / "c.yaml")
+        .split()
+    )
     return main([*words, "--out", str(tmp_path / "out")])
 
 
-@pytest.mark.parametrize(("command", "code"), [("compare", 1), ("explore", 2)])
+@pytest.mark.parametrize(
+    ("command", "code"), [("compare", 1), ("explore", 2), ("run", 2), ("divergence", 2)]
+)
 def test_a_sequence_without_depth_is_refused(command, code, blank, tmp_path, capsys):
     assert run(command, blank, tmp_path) == code
     last = capsys.readouterr().err.strip().splitlines()[-1]
@@ -75,9 +84,24 @@ def test_a_sequence_that_is_lost_throughout_is_a_failure(command, jumping, tmp_p
     assert run(command, jumping, tmp_path) == 1
     last = capsys.readouterr().err.strip().splitlines()[-1]
     assert "ms-slam: error: " in last
-    assert "lost in 6 of 6 frames" in last or "tracking lost in 100 % of the frames" in last
-    (name,) = {"results.json", "explore.json"} & {p.name for p in (tmp_path / "out").iterdir()}
+    assert (
+        re.search(r"lost in [56] of 6 frames", last)
+        or "tracking lost in 100 % of the frames" in last
+    )
+    (name,) = {"results.json", "explore.json", "metrics.json"} & {
+        p.name for p in (tmp_path / "out").iterdir()
+    }
     assert json.loads((tmp_path / "out" / name).read_text())["kind"]
+
+
+def test_what_a_recording_lacks_is_said(blank, tmp_path, capsys):
+    shutil.rmtree(blank / "rgb")
+    (blank / "groundtruth.txt").unlink()
+    assert run("run", blank, tmp_path) == 2
+    said = capsys.readouterr().err
+    assert "no colour: SLAM has depth alone" in said
+    assert "no true trajectory: errors are not measured" in said
+    assert not list((tmp_path / "out").rglob("*"))
 
 
 def test_what_counts_as_lost_throughout():

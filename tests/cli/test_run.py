@@ -1,8 +1,10 @@
 """``ms-slam run``: what it writes, and what an unfinished run leaves."""
 
 import json
+import os
 import re
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -186,15 +188,6 @@ def test_a_configuration_file_says_how_to_run(sequence, tmp_path):
     np.testing.assert_allclose(times, true_times[::3])
 
 
-def test_reduced_images_and_parameters(sequence, tmp_path):
-    out = tmp_path / "out"
-    command = ["run", str(sequence), "--out", str(out), "--params", "depth_cutoff_m=2.5"]
-    assert main(command) == 0
-    assert json.loads((out / "metrics.json").read_text())["params"] == {"depth_cutoff_m": 2.5}
-    farthest = np.linalg.norm(trimesh.load(out / "map.ply").vertices, axis=1).max()
-    assert np.isfinite(farthest)
-
-
 def test_a_run_that_fails_keeps_the_trajectory_so_far(sequence, tmp_path, capsys):
     broken = tmp_path / "broken"
     shutil.copytree(sequence, broken)
@@ -214,6 +207,7 @@ def test_a_run_that_fails_keeps_the_trajectory_so_far(sequence, tmp_path, capsys
     assert "5.png" in written["error"]
 
 
+@pytest.mark.skipif(os.name != "posix", reason="sends a signal")
 def test_an_interrupted_run_keeps_the_trajectory_so_far(sequence, tmp_path, capsys, monkeypatch):
     decode = Recording.frame
 
@@ -221,15 +215,17 @@ def test_an_interrupted_run_keeps_the_trajectory_so_far(sequence, tmp_path, caps
         if index == 4:
             so_far, _ = read_trajectory(out / "trajectory.incomplete.txt")
             assert len(so_far) == 4  # on disk already: a kill would not lose it either
-            raise KeyboardInterrupt  # what Ctrl-C raises
+            os.kill(os.getpid(), signal.SIGTERM)
         return decode(recording, index)
 
     out = tmp_path / "out"
     assert main(["run", str(sequence), "--out", str(out)]) == 0
     whole = (out / "trajectory.txt").read_text().splitlines()
     monkeypatch.setattr(Recording, "frame", frame)
-    assert main(["run", str(sequence), "--out", str(out)]) == 130
-    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("ms-slam: interrupted")
+    assert main(["run", str(sequence), "--out", str(out)]) == 143
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    said = f"ms-slam: interrupted by SIGTERM; 4 of {len(whole) - 1} frames are kept in {out}"
+    assert last == said
     # Nothing of the earlier, finished run is left to be taken for this one's.
     assert sorted(path.name for path in out.iterdir()) == [
         "frames.csv",
@@ -237,9 +233,10 @@ def test_an_interrupted_run_keeps_the_trajectory_so_far(sequence, tmp_path, caps
         "trajectory.incomplete.txt",
     ]
     assert (out / "trajectory.incomplete.txt").read_text().splitlines() == whole[:5]
+    assert len((out / "frames.csv").read_text().splitlines()) == 1 + 4
     written = json.loads((out / "metrics.json").read_text())
     assert (written["complete"], written["frames"]) == (False, 4)
-    assert written["error"] == "interrupted by SIGINT"
+    assert written["error"] == "interrupted by SIGTERM"
 
 
 def test_says_what_registration_it_assumes(sequence, tmp_path, capsys):
@@ -275,60 +272,3 @@ def test_manages_frames(sequence, tmp_path, capsys):
     }
     times, _ = read_trajectory(out / "trajectory.txt")
     assert len(times) == metrics["frames"] == FRAMES
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["run", "nowhere"], "sequence 'nowhere' is neither a folder nor scene:seed"),
-        (["run", "SEQUENCE", "--backend", "orb"], "unknown SLAM backend 'orb'; valid choices: su"),
-        (["run", "SEQUENCE", "--params", "speed"], "option 'speed' is not name=value"),
-        (["run", "SEQUENCE", "--params", "speed=1"], "'slam_config.speed'; valid choices"),
-        (["run", "SEQUENCE", "--intrinsics", "1 2 3"], "--intrinsics: expected 'fx fy cx cy width"),
-        (["run", "SEQUENCE", "--intrinsics", "1 2 3 4 5 x"], "--intrinsics: 'x' is not a number"),
-        (["run", "SEQUENCE", "--intrinsics", "9 9 4 3 9 7"], "is 80x60 but the intrinsics say 9x7"),
-        (["run", "SEQUENCE", "--image-size", "3x2"], "unknown image size '3x2'"),
-        (["run", "SEQUENCE", "--frame-management", "some"], "'some'; valid choices: none, regular"),
-        (["run", "SEQUENCE", "--frame-management", "divergence,x=1"], "frame_management.x"),
-        (
-            ["run", "SEQUENCE", "--config", "no.yaml"],
-            "cannot read configuration no.yaml: No such file",
-        ),
-    ],
-)
-def test_bad_input_is_one_line(arguments, message, sequence, tmp_path, capsys):
-    words = [str(sequence) if word == "SEQUENCE" else word for word in arguments]
-    assert main([*words, "--out", str(tmp_path / "out")]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert message in lines[-1]
-
-
-def test_a_sequence_that_shows_nothing_fails_in_words(tmp_path, capsys):
-    folder = tmp_path / "dark"
-    (folder / "depth").mkdir(parents=True)
-    for index in range(3):
-        Image.fromarray(np.zeros((60, 80), np.uint16)).save(folder / f"depth/{index}.png")
-    (folder / "intrinsics.txt").write_text("71 71 39.5 29.5 80 60 1000")
-    assert main(["run", str(folder), "--backend", "odometry", "--out", str(tmp_path / "out")]) == 2
-    assert not list((tmp_path / "out").rglob("*"))
-    said = capsys.readouterr().err
-    assert "no colour: SLAM has depth alone" in said
-    assert "no true trajectory: errors are not measured" in said
-    assert "ms-slam: error: sequence dark: no frame has a depth reading" in said
-    assert main(["divergence", str(folder), "--out", str(tmp_path / "out2")]) == 2
-    assert "no frame has a depth reading" in capsys.readouterr().err
-
-
-def test_a_sequence_that_is_lost_throughout_fails(tmp_path, capsys):
-    folder = tmp_path / "jumps"
-    (folder / "depth").mkdir(parents=True)
-    for index in (0, 1, 4):
-        depth = np.zeros((60, 80), np.uint16)
-        depth[20 * (index % 3) :][:5, :5] = 1000  # hardly a reading: nothing can be aligned
-        Image.fromarray(depth).save(folder / f"depth/{index}.png")
-    (folder / "intrinsics.txt").write_text("71 71 39.5 29.5 80 60 1000")
-    assert main(["run", str(folder), "--backend", "odometry", "--out", str(tmp_path / "out")]) == 1
-    said = capsys.readouterr().err
-    assert re.search(r"ms-slam: error: sequence jumps: lost in \d of 3 frames", said)
-    assert "ms-slam: warning: " in said
-    assert "leave out 2 frames" in said

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -40,11 +41,18 @@ def _with_holes(sequence, numbers):
     return replace(sequence, frames=tuple(frames))
 
 
-def test_lost_frames_say_why(sequence, tmp_path):
+@pytest.fixture(scope="module")
+def holed_run(sequence, tmp_path_factory):
+    """A sequence with two black frames, the folder of a run over it, and the run's result."""
+    folder = tmp_path_factory.mktemp("holed")
     holed = _with_holes(sequence, (6, 7))
-    result = run_to_folder(holed, "surfel", PARAMS, tmp_path)
+    return holed, folder, run_to_folder(holed, "surfel", PARAMS, folder)
+
+
+def test_lost_frames_say_why(holed_run):
+    holed, folder, result = holed_run
     assert result["lost_frames"] == 2
-    with (tmp_path / "frames.csv").open() as file:
+    with (folder / "frames.csv").open() as file:
         rows = list(csv.DictReader(file))
     own = SequenceRun(slam.make("surfel", holed.intrinsics, **PARAMS), holed)
     results = [step.result for step in own]
@@ -54,18 +62,18 @@ def test_lost_frames_say_why(sequence, tmp_path):
         expected = [getattr(result, key) for result in results]
         assert [float(row[key]) for row in rows] == pytest.approx(expected, abs=1e-3)
     # The picture looks at the map in the middle of the run, and leaves no trace in it.
-    _, poses = read_trajectory(tmp_path / "trajectory.txt")
+    _, poses = read_trajectory(folder / "trajectory.txt")
     np.testing.assert_allclose(poses, own.estimates, atol=1e-6)
     (line,) = result["lost_reasons"]
     assert line.startswith(f"2 frames, the first 6: {rows[6]['reason']}")
-    written = json.loads((tmp_path / "metrics.json").read_text())
+    written = json.loads((folder / "metrics.json").read_text())
     assert "Why frames were lost" in [table["title"] for table in written["tables"]]
-    assert (tmp_path / "refused.png").read_bytes()[1:4] == b"PNG"
+    assert (folder / "refused.png").read_bytes()[1:4] == b"PNG"
 
 
-def test_the_error_of_tracked_frames_stands_beside_the_headline(sequence, tmp_path):
-    result = run_to_folder(_with_holes(sequence, (6, 7)), "surfel", PARAMS, tmp_path)
-    _, poses = read_trajectory(tmp_path / "trajectory.txt")
+def test_the_error_of_tracked_frames_stands_beside_the_headline(sequence, holed_run):
+    _, folder, result = holed_run
+    _, poses = read_trajectory(folder / "trajectory.txt")
     ok = np.isin(np.arange(12), (6, 7), invert=True)
     assert result["tracked_share"] == pytest.approx(10 / 12)
     assert result["ate_tracked_m"] == pytest.approx(
@@ -74,8 +82,8 @@ def test_the_error_of_tracked_frames_stands_beside_the_headline(sequence, tmp_pa
     assert result["ate_m"] > 1.5 * result["ate_tracked_m"]
 
 
-def test_a_run_without_loss_draws_no_refused_frame(sequence, tmp_path):
-    run_to_folder(_with_holes(sequence, (6,)), "surfel", PARAMS, tmp_path)
+def test_a_run_without_loss_draws_no_refused_frame(sequence, holed_run, tmp_path):
+    shutil.copytree(holed_run[1], tmp_path, dirs_exist_ok=True)
     assert (tmp_path / "refused.png").exists()
     run_to_folder(sequence, "surfel", PARAMS, tmp_path)
     assert not (tmp_path / "refused.png").exists()

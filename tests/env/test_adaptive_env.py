@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
-
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 import ms_slam_env
 from ms_slam_env.env import ActiveSlamEnv
@@ -47,13 +44,6 @@ def test_the_id_is_listed_and_has_an_arm_unless_told_otherwise():
     np.testing.assert_array_equal(env.action_space.nvec, [49, 3])
     env.reset(seed=0)
     assert env.unwrapped.embodiment.__class__.__name__ == "DynamicArm"
-
-
-@pytest.mark.parametrize("observation", ["rgbd", "features"])
-def test_gymnasium_checker_finds_nothing(observation, recwarn):
-    env = gym.make(ID, observation=observation, **OPTIONS)
-    check_env(env.unwrapped, skip_render_check=True)
-    assert not [str(w.message) for w in recwarn if "infinity" not in str(w.message)]
 
 
 def test_the_mask_is_flat_and_the_configuration_is_seen(env):
@@ -109,21 +99,6 @@ def test_by_divergence_it_chooses_for_itself():
     assert levels[-1] == 0
 
 
-def test_saved_state_goes_on_to_the_bit_in_a_fresh_env(env):
-    env.reset(seed=5)
-    for action in actions(env, 3):
-        env.step(action)
-    state = pickle.loads(pickle.dumps(env.unwrapped.save_state()))
-    going_on = list(actions(env, 4, seed=1))
-    expected = [env.step(action) for action in going_on]
-    fresh = gym.make(ID, **OPTIONS)
-    fresh.reset(seed=99)
-    fresh.unwrapped.load_state(state)
-    assert_same_steps([fresh.step(action) for action in going_on], expected)
-    copied = pickle.loads(pickle.dumps(fresh.unwrapped))
-    assert_same_steps([copied.step([0, 1])], [fresh.unwrapped.step([0, 1])])
-
-
 @pytest.mark.parametrize("mode", [None, "sync"])
 def test_vector_environments(mode):
     venv = gym.make_vec(ID, num_envs=2, vectorization_mode=mode, **OPTIONS)
@@ -133,13 +108,6 @@ def test_vector_environments(mode):
     np.testing.assert_array_equal(info["slam_configuration"], [0, 2])
     cheap, dear = info["reward_terms"]["compute"]
     assert dear < cheap < 0
-
-
-@pytest.mark.parametrize("action", [3, [0, 3], [49, 0], [0.5, 0], [0, 1, 2], None])
-def test_bad_actions(env, action):
-    env.reset(seed=0)
-    with pytest.raises(InputError, match=r"is not two integers in \[0, 48\] x \[0, 2\]"):
-        env.unwrapped.step(action)
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,11 @@
 import dataclasses
 import math
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from ms_slam_baselines.belief import d_optimality
 from ms_slam_baselines.greedy import GreedyDivergence, distance_to_targets
+from small_env import FREE, small_env
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.geometry import invert, relative_angle
@@ -16,13 +16,11 @@ from ms_slam_env.planning.candidates import NAMES
 from ms_slam_env.planning.trackability import SCALE, slip_risk
 from ms_slam_env.planning.view_goals import best_goal
 
-OPTIONS = {"scene": "table", "scene_seed": 0, "image_size": "80x60", "disable_env_checker": True}
-FREE = "MSActiveSLAM-FreeCamera-v0"
 STATE = 37
 
 
 def make(env_id=FREE, observation="candidates", **options):
-    return gym.make(env_id, observation=observation, **{**OPTIONS, **options})
+    return small_env(env_id, observation=observation, **options)
 
 
 def numbers_of(observation):
@@ -148,17 +146,6 @@ def test_every_environment_has_it(env_id, motions, more):
     observation, _ = env.reset(seed=1)
     assert env.observation_space.contains(observation)
     assert env.observation_space.contains(env.step(env.action_space.sample() * 0)[0])
-
-
-def test_environments_side_by_side_see_what_one_alone_sees():
-    venv = gym.make_vec(
-        FREE, num_envs=2, vectorization_mode="sync", observation="candidates", **OPTIONS
-    )
-    observations, _ = venv.reset(seed=[3, 4])
-    alone, _ = make().reset(seed=4)
-    np.testing.assert_array_equal(observations[1], alone)
-    assert venv.observation_space.contains(observations)
-    venv.close()
 
 
 def test_steps_of_no_length_are_finite():

@@ -13,17 +13,20 @@ import ms_slam_env
 from ms_slam_env import scenes
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.config import EnvConfig, make_config
+from ms_slam_env.env.registry import OBSERVATIONS
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at
 from ms_slam_env.robot import decompose
 
 OPTIONS = {"scene": "living_room", "scene_seed": 0}
+ARM = {"scene": "table", "scene_seed": 0, "arm": {"frames_per_action": 2}}
 IDS = tuple(env_id for env_id in ms_slam_env.ENV_IDS if "Adaptive" not in env_id)
 """Those with actions that are one number; ``test_adaptive_env`` has the other."""
 NUM_ACTIONS = {
     "MSActiveSLAM-v0": 49,
     "MSActiveSLAM-FreeCamera-v0": 49,
     "MSActiveSLAM-FixedTranslation-v0": 7,
+    "MSActiveSLAM-Adaptive-v0": [49, 3],
 }
 
 
@@ -56,16 +59,25 @@ def env():
     env.close()
 
 
-@pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize(
-    "observation",
-    ["rgbd", "pixels", "features", "lookahead", "map", "goals", "held", "candidates"],
+    ("env_id", "options"),
+    [
+        *(("MSActiveSLAM-FreeCamera-v0", {"observation": name}) for name in OBSERVATIONS),
+        ("MSActiveSLAM-FixedTranslation-v0", {"observation": "held"}),
+        ("MSActiveSLAM-v0", {"observation": "rgbd"}),
+        ("MSActiveSLAM-v0", {"embodiment": "arm-kinematic", "scene": "wall"}),
+        *(
+            ("MSActiveSLAM-Adaptive-v0", {"embodiment": "free", "observation": name})
+            for name in ("rgbd", "features")
+        ),
+    ],
 )
-def test_gymnasium_checker_finds_nothing(env_id, observation, recwarn):
-    env = gym.make(env_id, observation=observation, **OPTIONS)
-    assert env.action_space.n == NUM_ACTIONS[env_id]
+def test_gymnasium_checker_finds_nothing(env_id, options, recwarn):
+    env = gym.make(env_id, **{**OPTIONS, **options})
+    assert np.array_equal(env.action_space.nvec if "Adaptive" in env_id else env.action_space.n,
+                          NUM_ACTIONS[env_id])  # fmt: skip
     check_env(env.unwrapped, skip_render_check=True)
-    assert not [str(warning.message) for warning in recwarn]
+    assert not [str(one.message) for one in recwarn if "infinity" not in str(one.message)]
 
 
 def test_every_documented_info_key_exists_and_no_other(env):
@@ -93,12 +105,24 @@ def test_ate_is_the_running_rmse_of_the_pose_error(env):
         assert info["ate"] == pytest.approx(np.sqrt(np.mean(np.square(errors))))
 
 
-@pytest.mark.parametrize("env_id", IDS[1:])
-def test_two_envs_with_one_seed_agree_to_the_bit(env_id):
-    a, b = (gym.make(env_id, observation="rgbd", **OPTIONS) for _ in range(2))
+@pytest.mark.parametrize(
+    ("env_id", "options"),
+    [*((env_id, OPTIONS) for env_id in IDS[1:]), ("MSActiveSLAM-v0", ARM)],
+)
+def test_two_envs_with_one_seed_agree_to_the_bit(env_id, options):
+    a, b = (gym.make(env_id, observation="rgbd", **options) for _ in range(2))
     assert_same(a.reset(seed=7), b.reset(seed=7))
     for action in random_actions(a, 6):
         assert_same(a.step(action), b.step(action))
+
+
+def test_at_one_place_another_seed_is_another_noise():
+    env = gym.make("MSActiveSLAM-FreeCamera-v0", observation="rgbd", image_size="64x48", **OPTIONS)
+    _, info = env.reset(seed=0)
+    here = {"T_world_camera": info["T_world_camera"]}
+    first, other, again = (env.reset(seed=seed, options=here)[0] for seed in (0, 1, 0))
+    assert_same(again, first)
+    assert (other["depth"] != first["depth"]).any()
 
 
 def test_episodes_in_a_row_are_in_one_scene_until_a_seed_draws_another():
@@ -188,31 +212,6 @@ def test_seeds_of_ones_own_are_drawn_from():
             EnvConfig(split=split)
 
 
-def test_another_seed_gives_another_episode(env):
-    first, _ = env.reset(seed=1)
-    second, _ = env.reset(seed=2)
-    assert not np.array_equal(first, second)
-
-
-@pytest.mark.parametrize("env_id", IDS[1:])
-def test_saved_state_goes_on_to_the_bit_in_a_fresh_env(env_id):
-    env = gym.make(env_id, **OPTIONS)
-    env.reset(seed=5)
-    for action in random_actions(env, 4):
-        env.step(action)
-    state = pickle.loads(pickle.dumps(env.unwrapped.save_state()))
-    actions = list(random_actions(env, 5, seed=1))
-    expected = [env.step(action) for action in actions]
-    expected_lookahead = env.unwrapped.lookahead()
-
-    fresh = gym.make(env_id, **OPTIONS)
-    fresh.reset(seed=99)
-    fresh.unwrapped.load_state(state)
-    for action, outcome in zip(actions, expected, strict=True):
-        assert_same(fresh.step(action), outcome)
-    np.testing.assert_array_equal(fresh.unwrapped.lookahead(), expected_lookahead)
-
-
 def table(seed):  # the name of a scene that there is
     """A scene as a function: a wall."""
     return scenes.make("wall", seed=seed)
@@ -263,33 +262,22 @@ def test_a_prediction_is_by_the_options_of_who_goes_on():
     np.testing.assert_array_equal(one.lookahead(), before)
 
 
-def test_a_state_of_another_camera_is_refused_and_changes_nothing(env):
-    env.reset(seed=5)
-    before = env.unwrapped.episode.trajectory_truth
-    other = gym.make("MSActiveSLAM-FreeCamera-v0", **{**OPTIONS, "noise": "none"})
-    other.reset(seed=6)
-    with pytest.raises(InputError, match=r"saved with noise = 'none'.*has 'kinect'"):
-        env.unwrapped.load_state(other.unwrapped.save_state())
-    np.testing.assert_array_equal(env.unwrapped.episode.trajectory_truth, before)
-
-
-def test_pickled_env_goes_on_to_the_bit(env):
-    env.reset(seed=6)
-    env.step(5)
-    twin = pickle.loads(pickle.dumps(env.unwrapped))
-    assert_same(env.unwrapped.step(36), twin.step(36))
-
-
 def test_pickling_before_reset_keeps_the_options():
     env = ActiveSlamEnv(step_m=0.03, **OPTIONS)
     assert pickle.loads(pickle.dumps(env)).config == env.config
 
 
-@pytest.mark.parametrize("mode", [None, "sync", "async"])
-def test_vector_modes_agree_with_the_single_env(env, mode):
-    vector = gym.make_vec(
-        "MSActiveSLAM-FreeCamera-v0", num_envs=2, vectorization_mode=mode, **OPTIONS
-    )
+@pytest.mark.parametrize(
+    ("mode", "env_id", "options"),
+    [
+        *((mode, "MSActiveSLAM-FreeCamera-v0", OPTIONS) for mode in (None, "sync", "async")),
+        (None, "MSActiveSLAM-v0", ARM),
+        ("sync", "MSActiveSLAM-FreeCamera-v0", {**OPTIONS, "observation": "candidates"}),
+    ],
+)
+def test_vector_modes_agree_with_the_single_env(mode, env_id, options):
+    env = gym.make(env_id, **options)
+    vector = gym.make_vec(env_id, num_envs=2, vectorization_mode=mode, **options)
     try:
         observations, _ = vector.reset(seed=[11, 12])
         stepped, rewards, *_ = vector.step(np.array([5, 36]))
@@ -368,12 +356,16 @@ def test_lookahead_predicts_every_candidate(reference):
         assert predicted[1:].max() > 0
 
 
-def test_black_frames_end_the_episode_as_lost(env, monkeypatch):
+def test_black_frames_in_a_row_end_the_episode_as_lost(env, monkeypatch):
     env.reset(seed=0)
     frame = env.unwrapped.episode.last_frame
     black = type(frame)(np.zeros_like(frame.color), np.zeros_like(frame.depth), 0.0)
-    monkeypatch.setattr(type(env.unwrapped.sensor), "capture", lambda *_, **__: black)
     patience = env.unwrapped.config.lost_patience
+    with monkeypatch.context() as dark:
+        dark.setattr(type(env.unwrapped.sensor), "capture", lambda *_, **__: black)
+        assert not any(env.step(0)[2] for _ in range(patience - 1))
+    assert env.step(0)[4]["tracking_ok"]  # and the count begins anew
+    monkeypatch.setattr(type(env.unwrapped.sensor), "capture", lambda *_, **__: black)
     for step in range(1, patience + 1):
         _, _, terminated, _, info = env.step(1)
         assert not info["tracking_ok"]
@@ -395,20 +387,35 @@ def test_render_explains_the_moment():
 
 
 @pytest.mark.parametrize(
-    "action", [49, -1, 3.0, "left", None, np.array([1, 2]), True, [[1], [2, 3]], {}, 10**400]
+    ("env_id", "said", "wrong"),
+    [
+        (
+            "MSActiveSLAM-FreeCamera-v0",
+            r"not an integer in \[0, 48\]",
+            [
+                *(49, -1, 3.0, "left", None, True, {}, 10**400, [[1], [2, 3]]),
+                *(np.array([1, 2]), np.array([[1], [2]])),
+            ],
+        ),
+        (
+            "MSActiveSLAM-FixedTranslation-v0",
+            r"not an integer in \[0, 6\]",
+            [7, -1, "left", 2.5, np.nan],
+        ),
+        (
+            "MSActiveSLAM-Adaptive-v0",
+            r"is not two integers in \[0, 48\] x \[0, 2\]",
+            [3, [0, 3], [49, 0], [0.5, 0], [0, 1, 2], None],
+        ),
+    ],
 )
-def test_bad_action_names_the_range(env, action):
+def test_bad_actions_name_their_range(env_id, said, wrong):
+    options = {"embodiment": "free"} if "Adaptive" in env_id else {}
+    env = gym.make(env_id, scene="carpet", scene_seed=0, **options).unwrapped
     env.reset(seed=0)
-    with pytest.raises(InputError, match=r"not an integer in \[0, 48\]"):
-        env.unwrapped.step(action)
-
-
-@pytest.mark.parametrize("action", [7, -1, "left", 2.5, np.nan])
-def test_bad_action_of_fewer_motions_names_their_range(action):
-    env = gym.make("MSActiveSLAM-FixedTranslation-v0", scene="carpet", scene_seed=0)
-    env.reset(seed=0)
-    with pytest.raises(InputError, match=r"not an integer in \[0, 6\]"):
-        env.step(action)
+    for action in wrong:
+        with pytest.raises(InputError, match=said):
+            env.step(action)
 
 
 def test_step_before_reset_of_a_made_env_says_so():

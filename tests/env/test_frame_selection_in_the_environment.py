@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ms_slam_env import slam
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.frame_selection import DivergenceFilterConfig, SelectiveSlam
@@ -42,29 +41,6 @@ def test_none_is_the_default_and_leaves_the_backend_alone():
         assert env.episode.processed.all()
     _assert_alike(runs[0], runs[1])
     _assert_alike(runs[0], runs[2])
-
-
-@pytest.mark.parametrize("backend", sorted(slam.BACKENDS))
-def test_every_backend_goes_on_bit_exactly_behind_a_filter(backend):
-    needs = {"volumetric": "open3d", "kinectfusion": "open3d", "sparse": "gtsam"}
-    pytest.importorskip(needs.get(backend, "numpy"), exc_type=ImportError)
-    management = {"name": "budget", "share": 0.5, "gain": 0.5}
-    env = ActiveSlamEnv("free", **OPTIONS, slam=backend, frame_management=management)
-    env.reset(seed=0)
-    _play(env, 3)
-    saved = env.save_state()
-    first = _play(env, 4, seed=1)
-    processed = env.episode.processed
-    assert processed[0]
-    assert 0 < processed.sum() < len(processed)
-    other = ActiveSlamEnv("free", **OPTIONS, slam=backend, frame_management=management)
-    for again in (env, other):
-        again.load_state(saved)
-        _assert_alike(first, _play(again, 4, seed=1))
-        np.testing.assert_array_equal(again.episode.processed, processed)
-    different = ActiveSlamEnv("free", **OPTIONS, slam=backend, frame_management="regular")
-    with pytest.raises(InputError, match="frame_management"):
-        different.load_state(saved)
 
 
 def test_a_dropped_frame_maps_nothing_and_has_a_predicted_pose():

@@ -1,20 +1,18 @@
 """The observation `map`: of the space that the episode's frames have carved, and that alone."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from small_env import small_env
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.errors import InputError
 from ms_slam_env.planning import OccupancyGrid, expected_gain, surrounding_occupancy
 
-OPTIONS = {"scene": "table", "scene_seed": 0, "image_size": "80x60", "disable_env_checker": True}
 BLOCKS = 2 * 10 * 6 * 10, 2 * 8 * 4 * 8
 
 
 def make(observation="map", **options):
-    env = gym.make("MSActiveSLAM-FreeCamera-v0", observation=observation, **OPTIONS, **options)
-    return env
+    return small_env(observation=observation, **options)
 
 
 def test_it_is_what_a_grid_carved_from_the_same_frames_says():
@@ -50,19 +48,6 @@ def test_an_episode_forgets_the_one_before():
     env.step(14)
     again, _ = env.reset(seed=1)
     np.testing.assert_array_equal(again, first)
-
-
-@pytest.mark.parametrize("observation", ["map", "goals", "held", "candidates"])
-def test_a_saved_state_holds_the_grid_and_goes_on_bit_exactly(observation):
-    env, other = make(observation), make(observation)
-    env.reset(seed=0)
-    env.step(14)
-    state = env.unwrapped.save_state()
-    goes_on = [env.step(action)[0] for action in (3, 41)]
-    other.reset(seed=5)
-    other.unwrapped.load_state(state)
-    for expected, action in zip(goes_on, (3, 41), strict=True):
-        np.testing.assert_array_equal(other.step(action)[0], expected)
 
 
 @pytest.mark.parametrize(

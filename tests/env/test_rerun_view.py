@@ -103,21 +103,3 @@ def test_without_rerun_it_says_what_to_install(monkeypatch, capsys, tmp_path):
         main(["view", "--scene", "table", "--steps", "1", "--save", str(tmp_path / "x.rrd")]) == 2
     )
     assert "pip install 'ms-slam-env[view]'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--planner", "nobody"), "unknown planner"),
-        (("--scene", "kitchn"), "unknown scene"),
-        (("--save", "."), "is a folder"),
-        (("--steps", "0"), "steps"),
-    ],
-)
-def test_bad_options_are_one_line(words, said, capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    assert main(["view", "--save", "x.rrd", *words]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []

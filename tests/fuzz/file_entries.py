@@ -429,7 +429,7 @@ ENTRIES = [
         for seed in (match3d, scannet, replica, vary_times, tum, euroc)
     ),
     Entry("bag", bags, one_bag, call_bag),
-    _of_folder("image", images, call_image, one_image),
+    Entry("image", images, one_image, call_image, in_tests=150),
     _of_folder("trajectory", lambda: {"a.txt": trajectory()}, call_trajectory),
     _of_folder("evaluate", two_trajectories, call_evaluate),
     _of_folder("surface", meshes, call_surface, one_mesh),

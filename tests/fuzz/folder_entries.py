@@ -385,6 +385,6 @@ ENTRIES = [
     Entry("outputs", outputs, mutated_outputs, call_outputs, in_tests=20),
     Entry("policy", as_bytes, mutated_policy, call_policy),
     Entry("study", study, mutated_study, call_study, in_tests=20),
-    Entry("report", results, mutated_results, call_report),
+    Entry("report", results, mutated_results, call_report, in_tests=100),
     Entry("records", rows, mutated_folder, call_records),
 ]

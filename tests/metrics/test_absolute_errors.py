@@ -1,4 +1,4 @@
-"""ATE of position and orientation against evo; alignments that cannot be had."""
+"""ATE of position and orientation against evo; alignments, and those that cannot be had."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from ms_slam_env.metrics import (
     ate_rmse,
     ate_statistics,
     find_alignment,
+    path_length,
+    rpe_rmse,
     tracked_errors,
+    umeyama,
 )
 from ms_slam_env.metrics.trajectory import ALIGNMENTS
 
@@ -166,6 +169,34 @@ def test_tracked_frames_are_aligned_by_themselves() -> None:
     assert few == {"ate_tracked_m": None, "tracked_share": 0.02}
 
 
+@given(st.integers(0, 1000), st.booleans())
+def test_umeyama_finds_the_motion_that_was_applied(seed, with_scale):
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(12, 3))
+    T = se3_exp(rng.normal(size=6))
+    scale = rng.uniform(0.2, 5) if with_scale else 1.0
+    target = scale * source @ T[:3, :3].T + T[:3, 3]
+    R, t, s = umeyama(source, target, with_scale)
+    np.testing.assert_allclose(make_pose(R, t), T, atol=1e-9)
+    assert s == pytest.approx(scale)
+
+
+def test_positions_are_accepted():
+    estimate, truth = drifting(1)
+    assert ate_rmse(estimate[:, :3, 3], truth[:, :3, 3]) == ate_rmse(estimate, truth)
+
+
+def test_a_standing_camera_has_no_error():
+    still = np.repeat(np.eye(4)[None], 5, axis=0)
+    assert ate_rmse(still, still) == pytest.approx(0, abs=1e-12)
+    assert rpe_rmse(still, still) == 0
+
+
+def test_path_length_of_a_square():
+    corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 0]]
+    assert path_length(corners) == 4
+
+
 WRONG = st.one_of(
     st.just(np.zeros((0, 4, 4))),
     st.just([]),
@@ -190,9 +221,10 @@ WRONG = st.one_of(
 def test_wrong_poses_are_one_clear_error(wrong: object, align: str, swap: bool) -> None:
     good = drifting(0, 6)[1]
     pair = (good, wrong) if swap else (wrong, good)
-    with pytest.raises(InputError) as caught:
-        ate_rmse(*pair, align, "rotation")
-    assert "\n" not in str(caught.value)
+    for measure in (lambda: ate_rmse(*pair, align, "rotation"), lambda: rpe_rmse(*pair)):
+        with pytest.raises(InputError) as caught:
+            measure()
+        assert "\n" not in str(caught.value)
 
 
 def test_wrong_options() -> None:
@@ -203,6 +235,8 @@ def test_wrong_options() -> None:
         ate_rmse(estimate, truth, kind="both")
     with pytest.raises(InputError, match="must correspond"):
         ate_rmse(estimate[1:], truth)
+    with pytest.raises(InputError, match="moves"):
+        ate_rmse(truth[:1].repeat(4, axis=0), truth[:4], align="sim3")
     with pytest.raises(InputError, match="se3, sim3, yaw align by the first poses, not origin"):
         ate_rmse(estimate, truth, "origin", first=3)
     with pytest.raises(InputError, match="first must be an integer >= 1"):

@@ -97,6 +97,13 @@ def test_seconds_are_paired_as_metres_of_a_path_at_one_metre_a_second(
     np.testing.assert_array_equal(found, expected)
 
 
+def test_rotation_error_near_pi_is_exact():
+    truth = np.repeat(np.eye(4)[None], 2, axis=0)
+    estimate = truth.copy()
+    estimate[1] = se3_exp([0, 0, 0, 0, 0, np.pi - 1e-6])
+    assert relative_errors(estimate, truth, kind="rotation")[0] == pytest.approx(np.pi - 1e-6)
+
+
 def test_a_second_of_a_drift_in_time() -> None:
     times = np.arange(30) / 10
     truth = np.repeat(np.eye(4)[None], 30, axis=0)
@@ -193,6 +200,7 @@ TIMES = np.arange(5.0)
         ({"delta": 0}, "integer >= 1"),
         ({"delta": 5}, "at least 6 poses, got 5"),
         ({"delta": 0.5}, "integer >= 1"),
+        ({"delta": True}, "integer >= 1"),
         ({"delta": 1.0, "unit": "m"}, "no two poses are 1 m apart: the trajectory spans 0 m"),
         ({"delta": -1.0, "unit": "m"}, "finite and > 0 m"),
         ({"delta": np.nan, "unit": "s", "times": TIMES}, "finite and > 0 s"),

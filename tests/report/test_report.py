@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from html import escape, unescape
 from itertools import chain
@@ -16,8 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from ms_slam_env.benchmark.experiment import Experiment, experiment_class
 from ms_slam_env.cli import main
@@ -25,7 +22,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.registry import CHANGED_KINDS, metric
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
 from ms_slam_env.report.discovery import find_results
-from ms_slam_env.report.page import page, write_report
+from ms_slam_env.report.page import write_report
 from ms_slam_env.report.plotly_charts import PALETTE, plots_of
 from ms_slam_env.report.results import RESULTS, read_results, write_result_folder, write_results
 from ms_slam_env.report.statistics import Interval
@@ -260,13 +257,6 @@ def test_a_guide_without_a_place_is_left_out(tmp_path: Path, value: Any) -> None
     assert '"name":"target"' not in report_of(tmp_path)
 
 
-def test_a_file_outside_the_folder_is_not_shown(tmp_path: Path) -> None:
-    (tmp_path / "secret.yaml").write_text("not of this folder")
-    write_example(tmp_path / "a/results.json")
-    (tmp_path / "a/link.yaml").symlink_to(tmp_path / "secret.yaml")
-    assert "not of this folder" not in report_of(tmp_path / "a")
-
-
 def test_what_is_no_result_is_named_and_not_guessed_at(tmp_path: Path) -> None:
     write_example(tmp_path / "a/results.json")
     (tmp_path / "list.json").write_text('[{"ate_m": 0.123456}]')
@@ -328,51 +318,6 @@ def test_hostile_text_reaches_the_page_only_escaped(tmp_path: Path) -> None:
     assert HOSTILE in unescape(text)
 
 
-def leaves(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Paths of everything in JSON."""
-    parts = content.items() if isinstance(content, dict) else enumerate(content)
-    for key, value in parts:
-        yield (*path, key)
-        if isinstance(value, (dict, list)):
-            yield from leaves(value, (*path, key))
-
-
-json_values = st.recursive(
-    st.sampled_from((None, True, 0, -1, 10**400, 0.5, float("nan"), "", "Infinity", "\ud800")),
-    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.text(max_size=3), inner),
-    max_leaves=4,
-)
-
-
-@pytest.fixture(scope="module")
-def example(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    path = write_example(tmp_path_factory.mktemp("example") / "results.json")
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
-
-
-@settings(max_examples=100, deadline=None)
-@given(data=st.data())
-def test_a_result_of_another_form_is_refused_or_shown(
-    data: st.DataObject, example: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    content = copy.deepcopy(example)
-    *parents, last = data.draw(st.sampled_from(list(leaves(content))))
-    inner: Any = content
-    for key in parents:
-        inner = inner[key]
-    inner[last] = data.draw(json_values)
-    folder = tmp_path_factory.mktemp("any")
-    (folder / "any.json").write_text(json.dumps(content))
-    try:
-        found, _ = find_results(folder)
-    except InputError:
-        return
-    text = page("any", found)
-    assert "NaN" not in text.rpartition("</main>")[0]  # JSON has no such number
-    found[0].results.as_markdown()
-
-
 def test_a_text_in_another_encoding_is_no_obstacle(tmp_path: Path) -> None:
     write_example(tmp_path / "results.json")
     (tmp_path / "notes.md").write_bytes("Größe".encode("latin-1"))
@@ -392,21 +337,6 @@ def test_the_page_is_one_file_with_plotly_in_it_once(
     assert written.count('<figure class="plot"') == 2
     assert 'href="#s2"' in written
     assert not list(out.parent.glob("*.partial"))
-
-
-def test_a_failed_write_leaves_the_old_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_example(tmp_path / "results.json")
-    (tmp_path / "report.html").write_text("old")
-
-    def fail(source: Path, target: Path) -> None:
-        raise OSError(28, "No space left on device", str(target))
-
-    monkeypatch.setattr(os, "replace", fail)
-    assert main(["report", str(tmp_path)]) == 1
-    assert (tmp_path / "report.html").read_text() == "old"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "results.json"]
 
 
 def make_nothing(folder: Path) -> None:

@@ -156,25 +156,19 @@ def test_a_bad_seed_is_refused(seed):
         scenes.make("wall", seed)
 
 
-def test_bad_mesh_files_are_refused(tmp_path):
-    with pytest.raises(InputError, match="does not exist") as error:
-        scenes.make(tmp_path / "missing.glb")
-    _single_line(error)
-    broken = tmp_path / "broken.glb"
-    broken.write_bytes(b"this is not a mesh")
-    with pytest.raises(InputError, match="cannot be read") as error:
-        scenes.make(broken)
-    _single_line(error)
-    cloud = tmp_path / "cloud.ply"
-    trimesh.PointCloud(np.random.default_rng(0).random((10, 3))).export(cloud)
-    with pytest.raises(InputError, match="no triangles") as error:
-        scenes.make(cloud)
-    _single_line(error)
-    empty = tmp_path / "empty.obj"
-    empty.write_text("# nothing\n")
-    with pytest.raises(InputError) as error:
-        scenes.make(empty)
-    _single_line(error)
+def test_bad_mesh_files_are_refused_in_one_line(tmp_path):
+    (tmp_path / "broken.glb").write_bytes(b"this is not a mesh")
+    (tmp_path / "empty.obj").write_text("# nothing\n")
+    trimesh.PointCloud(np.random.default_rng(0).random((10, 3))).export(tmp_path / "cloud.ply")
+    for name, said in (
+        ("missing.glb", "does not exist"),
+        ("broken.glb", "cannot be read"),
+        ("cloud.ply", "no triangles"),
+        ("empty.obj", ""),
+    ):
+        with pytest.raises(InputError, match=said) as error:
+            scenes.make(tmp_path / name)
+        _single_line(error)
 
 
 @pytest.mark.parametrize("read", [load_soup, lambda path: read_surface(path, 10)])
@@ -182,11 +176,12 @@ def test_what_is_no_mesh_inside_a_mesh_file_is_refused(tmp_path, read):
     """trimesh takes faces of vertices that are not there, and vertices of one number."""
     data = trimesh.creation.box().export(file_type="ply")
     first_face = data.index(b"end_header") + len(b"end_header\n") + 8 * 12 + 1
-    (tmp_path / "a.ply").write_bytes(
-        data[:first_face] + (2**30).to_bytes(4, "little") + data[first_face + 4 :]
-    )
-    with pytest.raises(InputError, match=r"a face has a vertex beyond the 8 that|is out of bounds"):
-        read(tmp_path / "a.ply")
+    for vertex in (2**30, 8, -1):
+        there = vertex.to_bytes(4, "little", signed=True)
+        (tmp_path / "a.ply").write_bytes(data[:first_face] + there + data[first_face + 4 :])
+        said = r"a face has a vertex beyond the 8 that|is out of bounds"
+        with pytest.raises(InputError, match=said):
+            read(tmp_path / "a.ply")
     (tmp_path / "b.obj").write_text("v -1.0000")
     with pytest.raises(InputError, match=r"b\.obj"):
         read(tmp_path / "b.obj")

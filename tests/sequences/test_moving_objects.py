@@ -19,7 +19,6 @@ from ms_slam_env.sequences import (
     PoseInterpolation,
     RollingShutter,
     handheld_trajectory,
-    make_perturbation,
     read_trajectory,
     render_sequence,
 )
@@ -208,23 +207,6 @@ def test_blur_and_rolling_rows_go_with_the_objects(box_scene) -> None:
     shear = rolling.frames[k].depth != plain.frames[k].depth
     assert shear.any()
     assert not shear[far].any()
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        ("moving-objects", {"kind": "dog"}, "box, person, car"),
-        ("moving-objects", {"count": -1}, "count"),
-        ("moving-objects", {"speed_m_s": 0.0}, "speed_m_s"),
-        ("fast-motion", {"factor": 0.5}, "factor"),
-        ("fast-motion", {"share": 1.5}, "share"),
-        ("illumination", {"dim": 1.0}, "dim"),
-        ("illumination", {"lamp": -1.0}, "lamp"),
-    ],
-)
-def test_bad_strengths_are_refused(name, options, message) -> None:
-    with pytest.raises(InputError, match=message):
-        make_perturbation(name, options)
 
 
 def test_no_room_for_a_car_is_one_clear_line(box_scene, path) -> None:

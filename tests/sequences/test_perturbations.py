@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image, xtion
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import make_pose, se3_exp, so3_exp, transform_points
+from ms_slam_env.geometry import make_pose, se3_exp, so3_exp
 from ms_slam_env.sensor import NoiseConfig, RGBDSensor
 from ms_slam_env.sequences import (
     PERTURBATIONS,
@@ -205,17 +205,6 @@ def test_misregistered_colour_is_that_of_the_other_camera(box_scene: BoxScene, p
     np.testing.assert_array_equal(frame.depth, depth)
 
 
-def test_a_world_point_moves_as_the_offsets_say(box_scene: BoxScene, path) -> None:
-    """The closed form behind the registration of unregistered recordings."""
-    view = render_sequence(box_scene, path, K, "none").frames.truth(0)
-    point = transform_points(np.linalg.inv(path[0]), view.points[30, 40])
-    color = Intrinsics(0.9 * K.fx, 0.9 * K.fy, K.cx, K.cy, K.width, K.height)
-    u = color.project(point - [0.025, 0, 0])[0]
-    assert u == pytest.approx(
-        K.cx + 0.9 * (40 - K.cx - K.fx * 0.025 / view.depth[30, 40]), abs=1e-3
-    )
-
-
 # ---------------------------------------------------------------- exposure
 
 
@@ -372,6 +361,13 @@ def test_truth_is_what_an_ideal_camera_sees(box_scene: BoxScene, path) -> None:
         (lambda: DepthDropout(patches=1.0), "DepthDropout.patches"),
         (lambda: FrameSkipping(0), "FrameSkipping.keep_every"),
         (lambda: ExposureRamp(gain=float("nan")), "ExposureRamp.gain"),
+        (lambda: make_perturbation("moving-objects", {"kind": "dog"}), "box, person, car"),
+        (lambda: make_perturbation("moving-objects", {"count": -1}), "count"),
+        (lambda: make_perturbation("moving-objects", {"speed_m_s": 0.0}), "speed_m_s"),
+        (lambda: make_perturbation("fast-motion", {"factor": 0.5}), "factor"),
+        (lambda: make_perturbation("fast-motion", {"share": 1.5}), "share"),
+        (lambda: make_perturbation("illumination", {"dim": 1.0}), "dim"),
+        (lambda: make_perturbation("illumination", {"lamp": -1.0}), "lamp"),
     ],
 )
 def test_bad_strengths_are_refused(make, message) -> None:

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from ms_slam_env.camera import Intrinsics
@@ -459,35 +457,6 @@ def test_broken_images(tum, kind, case):
         recording.frame(1)
     assert re.search(rf"depth\.txt:2: .*{kind}/1\.png", str(caught.value))
     assert "\n" not in str(caught.value)
-
-
-@settings(max_examples=150, deadline=None)
-@given(st.integers(0, 2**32), st.sampled_from(["cut", "flip", "insert"]))
-def test_a_damaged_file_gives_an_image_or_one_clear_error(tmp_path_factory, seed, damage):
-    rng = np.random.default_rng(seed)
-    folder = tmp_path_factory.getbasetemp() / "damaged"
-    if not folder.exists():
-        write_images(folder, 1)
-        (folder / "intrinsics.txt").write_text(f"{INTRINSICS} 1000")
-        (folder / "whole.bin").write_bytes((folder / "depth/0.png").read_bytes())
-    data = bytearray((folder / "whole.bin").read_bytes())
-    where = int(rng.integers(0, len(data)))
-    if damage == "cut":
-        del data[where:]
-    elif damage == "flip":
-        for k in rng.integers(0, len(data), 4):
-            data[k] ^= int(rng.integers(1, 256))
-    else:
-        data[where:where] = rng.bytes(7)
-    (folder / "depth/0.png").write_bytes(bytes(data))
-    recording = open_recording(folder)
-    complaint = "depth/0.png"
-    try:
-        assert recording.frame(0).depth.shape == (HEIGHT, WIDTH)
-    except InputError as error:
-        complaint = str(error)
-    assert "depth/0.png" in complaint
-    assert "\n" not in complaint
 
 
 def test_unsorted_and_duplicate_associations(tum):

@@ -66,19 +66,6 @@ def test_loops_of_a_circle():
     assert again[205:].all()
 
 
-def test_passing_a_place_in_another_direction_is_no_loop():
-    there = circle(1.0)
-    turned = there.copy()
-    turned[:, :3, [0, 2]] *= -1.0  # looks backwards
-    assert count_loops(np.concatenate([there[:-20], turned[:-20]])) == 0
-
-
-def test_two_separate_returns_are_two_loops():
-    a, b = circle(1.1), circle(1.1)
-    b[:, 0, 3] += 40.0
-    assert count_loops(np.concatenate([a, b])) == 2
-
-
 def test_the_suite_is_what_the_paper_says_in_words():
     names = [entry.name for entry in SUITE]
     assert len(names) == len(set(names)) == 8

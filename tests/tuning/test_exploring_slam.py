@@ -280,36 +280,6 @@ def test_a_grid_measures_each_point_once(sequences, tmp_path):
         Grid(make_space(["image_size"]), evaluator, 3, tmp_path / "other.jsonl")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--sampler", "grid"], "valid choices: random, nsga2, tpe, gp"),
-        (["--objectives", "ate", "ext_ms"], "unknown objective 'ate'"),
-        (["--constraints", "ate_m=1"], "is not metric<limit"),
-        (["--constraints", "ext_ms>1"], "is not metric<limit, as in ate_m<0.01, nor M_I>limit"),
-        (["--parameters", "threads"], "parameter 'threads' is absent: Warp runs a kernel on one"),
-        (["--parameters", "compiler.speed"], "unknown parameter"),
-        (["--tolerance", "0.5"], "tolerance = 0.5 is outside"),
-        (["--parameters", "speed"], "unknown parameter 'speed'"),
-        (["--sequences", "nowhere"], "sequence 'nowhere' is neither a folder nor"),
-        (["--sequences", "nowhere:1000"], "unknown scene 'nowhere'"),
-        (["--held-out", "nowhere:1000"], "unknown scene 'nowhere'"),
-        (["--held-out", "."], "is no RGB-D sequence"),
-        (["--held-out", "table:1002"], "sequence table:1002 is explored and held out"),
-        (["--trials", "0"], "trials = 0 must be at least 1"),
-        (["--config", "no.yaml"], "cannot read configuration no.yaml"),
-        (["--clock", "sundial"], "valid choices: processor, wall"),
-        (["--frames", "3"], "frames = 3 is outside"),
-        (["--image-size", "3x3"], "unknown image size '3x3'"),
-    ],
-)
-def test_bad_input_is_one_line(options, message, tmp_path, capsys):
-    assert main(["explore", *options, "--out", str(tmp_path / "out")]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert message in lines[-1]
-    assert not (tmp_path / "out").exists()  # a study there would keep the bad input
-
-
 def test_energy_is_refused_where_there_is_none(sequences, monkeypatch):
     if not energy_counters()["cpu"].reason:
         pytest.skip("this machine counts energy")
