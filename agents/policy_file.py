@@ -23,8 +23,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from ms_slam_env._runtime.output_files import write_bytes
-from ms_slam_env.env.config import EnvConfig
 from ms_slam_env.env.embodiments import EMBODIMENTS
+from ms_slam_env.env.env_config import EnvConfig
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.report.records import build, to_plain
 

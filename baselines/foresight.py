@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import check_range, check_whole
 from ms_slam_env.env import PrivilegedPlanner
-from ms_slam_env.env.config import RewardConfig
+from ms_slam_env.env.env_config import RewardConfig
 from ms_slam_env.errors import unknown
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import check_range
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env import Planner
-from ms_slam_env.env.config import LookaheadConfig, TargetConfig
+from ms_slam_env.env.env_config import LookaheadConfig, TargetConfig
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.errors import InputError, unknown
 

@@ -20,7 +20,7 @@ from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame, intensity_image, xtion
 from ms_slam_env.divergence import Divergence, DivergenceConfig, make_divergence
-from ms_slam_env.env.config import EnvConfig, LookaheadConfig
+from ms_slam_env.env.env_config import EnvConfig, LookaheadConfig
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import SequenceRun
@@ -30,7 +30,7 @@ from ms_slam_env.report.tables import Table, finished, make_table, summary
 from ms_slam_env.robot import CAMERA_RADIUS_M, NUM_ROTATIONS
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.scenes import PUBLISHED_ROOMS
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import handheld_trajectory

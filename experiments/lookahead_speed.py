@@ -17,7 +17,7 @@ from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.divergence import DivergenceConfig
-from ms_slam_env.env.config import EnvConfig, LookaheadConfig
+from ms_slam_env.env.env_config import EnvConfig, LookaheadConfig
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.records import Row

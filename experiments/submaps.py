@@ -20,7 +20,7 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.evaluation.loop_closures import pose_error
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
-from ms_slam_env.evaluation.submaps import submap_errors, submap_measures, submap_numbers
+from ms_slam_env.evaluation.submap_errors import submap_errors, submap_measures, submap_numbers
 from ms_slam_env.geometry import invert, so3_exp
 from ms_slam_env.report.charts import Chart, Panel, interval_series
 from ms_slam_env.report.records import Row

@@ -7,7 +7,7 @@ from scipy.ndimage import zoom
 
 from ms_slam_env._runtime.arrays import Float64, Int32
 from ms_slam_env.geometry import look_at
-from ms_slam_env.scenes.base import Scene, TexturedMesh
+from ms_slam_env.scenes.scene import Scene, TexturedMesh
 
 ROOM_LOW = np.array([-2.0, -2.0, 0.0])
 ROOM_HIGH = np.array([2.0, 2.0, 2.5])

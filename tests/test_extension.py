@@ -27,7 +27,8 @@ from ms_slam_env._runtime.parallel import open_pool, run_each
 from ms_slam_env.benchmark import EXPERIMENTS, experiment_class
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli.train import TRAINERS
-from ms_slam_env.env import config, observations
+from ms_slam_env.env import env_config as config
+from ms_slam_env.env import observations
 from ms_slam_env.env.planners import PLANNERS, check_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import registry

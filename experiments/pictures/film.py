@@ -39,7 +39,7 @@ from ms_slam_env.env.third_person_view import (
 )
 from ms_slam_env.errors import InputError
 from ms_slam_env.planning.occupancy_grid import OccupancyGrid
-from ms_slam_env.scenes.base import Scene, floor_height
+from ms_slam_env.scenes.scene import Scene, floor_height
 
 _SIZE = (560, 480)  # width and height of the map
 _MARGIN_M = 0.2

@@ -29,7 +29,7 @@ from ms_slam_env._runtime.command_line import exit_code, parse
 from ms_slam_env._runtime.output_files import check_out_file, check_out_folder, write_bytes
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.camera import Intrinsics, xtion
-from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.env.env_config import EnvConfig
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import invert, look_at, transform_points
 from ms_slam_env.robot.arm import ArmConfig

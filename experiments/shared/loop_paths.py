@@ -7,9 +7,9 @@ import numpy as np
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import look_at
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sequences.paths import HandheldPath
-from ms_slam_env.sequences.paths.base import frame_times
+from ms_slam_env.sequences.paths.camera_path import frame_times
 
 HEIGHT_M = 1.3
 CLEARANCE_M = 0.35  # free space kept around the camera

@@ -19,7 +19,7 @@ from ms_slam_env.config import Checked, bounded, chosen, nested_options
 from ms_slam_env.env import Planner
 from ms_slam_env.env.planners import check_planner, make_planner, planner_observation
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.registration import ADAPTIVE_ID
+from ms_slam_env.gym_ids import ADAPTIVE_ID
 from ms_slam_env.scenes import SEED_SPLITS, seeds_of
 from ms_slam_env.scenes.registry import check_name, is_mesh_file
 from ms_slam_env.tasks import find_task
@@ -238,8 +238,8 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
         InputError: no ``=``, an unknown name (the message lists the valid ones), a value out of
             range, or a name that the benchmark sets itself.
     """
-    from ms_slam_env.env.config import make_config
     from ms_slam_env.env.embodiments import EMBODIMENTS
+    from ms_slam_env.env.env_config import make_config
 
     result = nested_options(texts)
     for name in result:

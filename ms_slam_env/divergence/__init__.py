@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ms_slam_env.camera import Intrinsics, check_camera
-from ms_slam_env.divergence.config import MEASURES, DivergenceConfig
 from ms_slam_env.divergence.counting import Histograms
+from ms_slam_env.divergence.divergence_config import MEASURES, DivergenceConfig
 from ms_slam_env.divergence.measures import (
     Divergence,
     EarthMoversDivergence,

@@ -15,7 +15,7 @@ from ms_slam_env._runtime.arrays import Float64, Int32
 from ms_slam_env._runtime.warp import HostDeviceBuffer, RecordedLaunch, wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.divergence import kernels
-from ms_slam_env.divergence.config import DivergenceConfig
+from ms_slam_env.divergence.divergence_config import DivergenceConfig
 from ms_slam_env.divergence.sphere import MAP_SIZE, bin_directions, bins_near
 from ms_slam_env.errors import InputError
 

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env.camera import Intrinsics, RGBDFrame, check_camera, intensity_image
 from ms_slam_env.camera.frame import check_readings
-from ms_slam_env.divergence.config import DivergenceConfig
 from ms_slam_env.divergence.counting import HistogramCounter, grouping_matrix, normalise
+from ms_slam_env.divergence.divergence_config import DivergenceConfig
 from ms_slam_env.divergence.measures import kl_divergence
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import as_numbers

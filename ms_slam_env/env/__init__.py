@@ -6,7 +6,7 @@ from ms_slam_env._runtime.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ms_slam_env.env.active_slam import ActiveSlamEnv
-    from ms_slam_env.env.config import EnvConfig, LookaheadConfig
+    from ms_slam_env.env.env_config import EnvConfig, LookaheadConfig
     from ms_slam_env.env.episode import Episode
     from ms_slam_env.env.planners import Planner, PrivilegedPlanner
     from ms_slam_env.env.reward import RewardConfig, TargetConfig

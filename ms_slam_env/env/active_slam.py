@@ -15,9 +15,9 @@ from ms_slam_env._runtime.extension import load_reference
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.env.actions import ActionDecoder, MotionActions, MotionAndConfigurationActions
 from ms_slam_env.env.camera_feed import CameraFeed, make_camera_feed
-from ms_slam_env.env.config import check_reset, make_config
 from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EMBODIMENTS
+from ms_slam_env.env.env_config import check_reset, make_config
 from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.env.observations import CONFIGURATION, make_observation
@@ -30,9 +30,9 @@ from ms_slam_env.geometry import check_pose
 from ms_slam_env.planning.candidates import PredictedViews
 from ms_slam_env.planning.trackability import SCALE
 from ms_slam_env.robot import Embodiment
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.sequences.perturbations.base import Perturbation
+from ms_slam_env.sequences.perturbations.perturbation import Perturbation
 from ms_slam_env.slam.slam_backend import SlamBackend, Views
 
 VIEWS = {

@@ -13,9 +13,9 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.extension import load_reference
 from ms_slam_env.camera import Distortion, RGBDFrame
 from ms_slam_env.camera.distortion import NO_DISTORTION
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.sequences.perturbations.base import Perturbation
+from ms_slam_env.sequences.perturbations.perturbation import Perturbation
 from ms_slam_env.slam.shared.state_check import SEED
 
 _PERTURBED = "ms_slam_env.env.perturbed_feed:PerturbedFeed"  # where it is asked for by name

@@ -16,7 +16,7 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import RecordedLaunch
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 
 _STRIDE = 2  # every second pixel in each direction marks coverage
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 from ms_slam_env._runtime.extension import load_reference
 from ms_slam_env._runtime.timings import Timings
-from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.env.env_config import EnvConfig
 from ms_slam_env.env.pose_sources import KINEMATIC_SOURCES
 from ms_slam_env.errors import InputError
 from ms_slam_env.robot import NUM_MOTIONS, Embodiment, FixedTranslation, FreeCamera
 from ms_slam_env.robot.arm import ArmConfig, load_arm
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 
 
 @dataclass(frozen=True)

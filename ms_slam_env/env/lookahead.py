@@ -10,7 +10,7 @@ import numpy as np
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import DivergenceConfig, Histograms, make_divergence
-from ms_slam_env.env.config import LookaheadConfig
+from ms_slam_env.env.env_config import LookaheadConfig
 from ms_slam_env.slam.slam_backend import Views
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from ms_slam_env._runtime.extension import load_reference
 from ms_slam_env.config import is_options, parse_named
 from ms_slam_env.env.active_slam import VIEWS, ActiveSlamEnv
-from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.env.env_config import EnvConfig
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.sequences.perturbations import make_perturbation
 from ms_slam_env.tasks import Task, find_task

@@ -12,10 +12,10 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Distortion, RGBDFrame, xtion
 from ms_slam_env.env.camera_feed import CameraFeed
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.sequences.perturbations.base import Perturbation
 from ms_slam_env.sequences.perturbations.movers import Mover
+from ms_slam_env.sequences.perturbations.perturbation import Perturbation
 from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 from ms_slam_env.slam.shared.state_check import MOST, SEED, ListOf, Real

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 
 from ms_slam_env._runtime.arrays import Float64, Image
-from ms_slam_env.env.config import TargetConfig
+from ms_slam_env.env.env_config import TargetConfig
 from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.point_renderer import BACKGROUND
 from ms_slam_env.env.third_person_view import ESTIMATE_COLOR, draw_third_person
 from ms_slam_env.robot import Embodiment, describe
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.slam.slam_backend import SlamBackend
 
 PANEL = (240, 320)

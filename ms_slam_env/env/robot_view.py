@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ms_slam_env.env.reward import TargetConfig
     from ms_slam_env.planning import OccupancyGrid
     from ms_slam_env.robot import Embodiment
-    from ms_slam_env.scenes.base import Scene
+    from ms_slam_env.scenes.scene import Scene
 
 
 TRUTH = (

@@ -14,17 +14,17 @@ from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.divergence import Histograms, make_divergence
 from ms_slam_env.env.camera_feed import make_camera_feed
-from ms_slam_env.env.config import MAP, EnvConfig
 from ms_slam_env.env.coverage import CoverageGrid
 from ms_slam_env.env.embodiments import EmbodimentType
+from ms_slam_env.env.env_config import MAP, EnvConfig
 from ms_slam_env.env.episode import Episode
 from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.errors import InputError, UnreachableError, unknown
 from ms_slam_env.geometry import invert
 from ms_slam_env.planning import OccupancyGrid
 from ms_slam_env.robot import Embodiment, MotionResult
-from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.registry import SCENES, SceneName, name_of
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult

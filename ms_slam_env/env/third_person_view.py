@@ -14,7 +14,7 @@ from ms_slam_env.geometry import look_at, transform_points
 from ms_slam_env.robot import Embodiment
 from ms_slam_env.robot.arm.arm import ArmEmbodiment
 from ms_slam_env.robot.arm.shape import arm_parts, column_parts, surface_dots
-from ms_slam_env.scenes.base import Scene, floor_height
+from ms_slam_env.scenes.scene import Scene, floor_height
 from ms_slam_env.slam.slam_backend import SlamBackend
 
 TRUE_COLOR = (110, 215, 110)

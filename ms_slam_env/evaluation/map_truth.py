@@ -23,8 +23,8 @@ from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.geometry.point_clouds import IndexedCloud
 from ms_slam_env.robot import Embodiment
 from ms_slam_env.robot.arm.arm import ArmEmbodiment, camera_poses
-from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import RayCaster
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor.scene_cache import get_scene
 
 RADIUS_M = 3.0  # what a view reaches, in every direction; part of the protocol

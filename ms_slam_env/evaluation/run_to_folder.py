@@ -25,7 +25,7 @@ from ms_slam_env.evaluation.run_files import (
     write_ply,
 )
 from ms_slam_env.evaluation.run_sequence import SequenceRun
-from ms_slam_env.evaluation.submaps import (
+from ms_slam_env.evaluation.submap_errors import (
     paths_by_submap,
     submap_errors,
     submap_measures,

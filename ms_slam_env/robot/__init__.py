@@ -14,7 +14,7 @@ if TYPE_CHECKING:
         decompose,
         describe,
     )
-    from ms_slam_env.robot.base import Embodiment, MotionResult
+    from ms_slam_env.robot.embodiment import Embodiment, MotionResult
     from ms_slam_env.robot.free_camera import CAMERA_RADIUS_M, FixedTranslation, FreeCamera
 else:
     __getattr__ = lazy_names(__name__)

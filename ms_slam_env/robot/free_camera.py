@@ -17,8 +17,8 @@ from ms_slam_env.robot.action_primitives import (
     TRANSLATION_DIRECTIONS,
     decompose,
 )
-from ms_slam_env.robot.base import Embodiment, HasClearance, MotionResult
-from ms_slam_env.scenes.base import Scene, outside, words
+from ms_slam_env.robot.embodiment import Embodiment, HasClearance, MotionResult
+from ms_slam_env.scenes.scene import Scene, outside, words
 
 CAMERA_RADIUS_M = 0.1  # half the width of an ASUS Xtion (18 cm), rounded up
 _LOOKED_AT_M = 0.05  # between two places of a way in a known world

@@ -1,6 +1,5 @@
 """Textured, lit scenes by name and seed (rooms, homes, a hall, streets), and mesh files by path."""
 
-from ms_slam_env.scenes.base import Scene, TexturedMesh
 from ms_slam_env.scenes.registry import (
     HOMES,
     LARGE_SCENES,
@@ -12,6 +11,7 @@ from ms_slam_env.scenes.registry import (
     seeds_of,
     split_of,
 )
+from ms_slam_env.scenes.scene import Scene, TexturedMesh
 
 __all__ = [
     "HOMES",

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ms_slam_env._runtime.arrays import Float32, Float64, Int32
-from ms_slam_env.scenes.base import Rng, TexturedMesh
+from ms_slam_env.scenes.scene import Rng, TexturedMesh
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.furniture import decor, industrial
 from ms_slam_env.scenes.lighting import Light, Lighting, Panel, light_and_expose
 from ms_slam_env.scenes.mesh_scene import LargeScene
 from ms_slam_env.scenes.room import Room
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import industrial as finish
 from ms_slam_env.scenes.textures.noise import hsv
 

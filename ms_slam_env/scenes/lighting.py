@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from ms_slam_env._runtime.arrays import Float32, Float64
-from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.scenes.builder import Geometry, MeshBuilder
 from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross
+from ms_slam_env.scenes.scene import TexturedMesh
 
 _FAR_M = 100.0
 _SHADOW_END = 0.999  # a shadow ray stops just before the light, which may be a surface itself

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.furniture import decor, pieces, small_things
 from ms_slam_env.scenes.lighting import Lamp, Lighting, Panel, Sun, light_and_expose
 from ms_slam_env.scenes.mesh_scene import MeshScene, free_space_around
 from ms_slam_env.scenes.room import PANE, Room, Window, floor_material, wall_colour, wall_material
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import interior
 
 _KEY = 0.18

@@ -15,7 +15,6 @@ from tqdm import tqdm
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes import mesh_cache
-from ms_slam_env.scenes.base import Rng, TexturedMesh
 from ms_slam_env.scenes.builder import Geometry
 from ms_slam_env.scenes.free_space import Enclosed, FreeSpace, voxel_for
 from ms_slam_env.scenes.lighting import Lamp, Lighting, auto_exposure, light_mesh
@@ -23,6 +22,7 @@ from ms_slam_env.scenes.mesh_formats import MESH_SUFFIXES, MeshFile
 from ms_slam_env.scenes.mesh_formats.part import MAX_TEXELS, Part
 from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross, sample_surface
 from ms_slam_env.scenes.mesh_scene import MeshScene, unit_rows
+from ms_slam_env.scenes.scene import Rng, TexturedMesh
 
 _GREY = np.array([190, 190, 190], np.uint8)
 _MAX_TRIANGLES = 900_000

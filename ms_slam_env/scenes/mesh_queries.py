@@ -10,7 +10,7 @@ from embreex.mesh_construction import TriangleMesh
 from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import TexturedMesh
+from ms_slam_env.scenes.scene import TexturedMesh
 
 
 class RayCaster:

@@ -8,9 +8,9 @@ import numpy as np
 
 from ms_slam_env._runtime.arrays import Bool, Float64, Int32
 from ms_slam_env.geometry import look_at, so3_exp
-from ms_slam_env.scenes.base import Rng, Scene, TexturedMesh
 from ms_slam_env.scenes.free_space import VOXEL_M, FreeSpace, Holding
 from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross, sample_surface
+from ms_slam_env.scenes.scene import Rng, Scene, TexturedMesh
 
 StartRule = Callable[[Rng], tuple[Float64, Float64]]
 """Draws a candidate (eye (3,), target (3,)) of a start pose."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from ms_slam_env._runtime.extension import ExtensionPoint, load_reference
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_formats import MESH_SUFFIXES, MeshFile
+from ms_slam_env.scenes.scene import Scene
 
 _ROOMS = {
     "living_room": "ms_slam_env.scenes.living_room:living_room",

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder, pick
 from ms_slam_env.scenes.mesh_scene import LargeScene
 from ms_slam_env.scenes.outdoors import houses, street_furniture
 from ms_slam_env.scenes.outdoors.daylight import daylight_scene
 from ms_slam_env.scenes.outdoors.plan import KERB_M, Plot, StreetPlan, sides_of
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import interior, outdoor
 
 _CELL_M = 0.45

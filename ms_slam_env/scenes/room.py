@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import interior
 from ms_slam_env.scenes.textures.noise import hsv
 

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.furniture import decor, pieces, small_things
 from ms_slam_env.scenes.lighting import Light, Lighting, Panel, Sun, light_and_expose
 from ms_slam_env.scenes.mesh_scene import MeshScene, SceneMaker, StartRule, free_space_around
 from ms_slam_env.scenes.room import PANE, Room, Window, floor_material, wall_colour
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import fabric, interior
 from ms_slam_env.scenes.textures.noise import hsv
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.geometry import invert
-from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.scenes.mesh_queries import face_cross
+from ms_slam_env.scenes.scene import TexturedMesh
 from ms_slam_env.sensor.casters import RayCaster
 from ms_slam_env.sensor.rays import Pinhole, make_hits
 from ms_slam_env.sensor.textures import face_planes

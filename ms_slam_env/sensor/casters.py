@@ -11,7 +11,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from ms_slam_env._runtime.warp import RecordedLaunch, wp
-from ms_slam_env.scenes.base import TexturedMesh
+from ms_slam_env.scenes.scene import TexturedMesh
 from ms_slam_env.sensor.embree import (
     TILE_HEIGHT,
     TILE_WIDTH,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env._runtime.warp import wp
-from ms_slam_env.scenes.base import TexturedMesh
+from ms_slam_env.scenes.scene import TexturedMesh
 from ms_slam_env.sensor.bodies import Body, BodyCast
 from ms_slam_env.sensor.casters import RayCaster
 from ms_slam_env.sensor.rays import Hits, Pinhole, keep_nearer

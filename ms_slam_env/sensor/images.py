@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._runtime.warp import HostDeviceBuffer, RecordedLaunch, wp
-from ms_slam_env.scenes.base import TexturedMesh
+from ms_slam_env.scenes.scene import TexturedMesh
 from ms_slam_env.sensor.bodies import Body
 from ms_slam_env.sensor.casters import RayCaster
 from ms_slam_env.sensor.changes import ChangingLight, ChangingView

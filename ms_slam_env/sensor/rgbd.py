@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor.bodies import Body, joined
 from ms_slam_env.sensor.casters import RayCaster, make_caster
 from ms_slam_env.sensor.changes import ChangingLight

@@ -8,8 +8,8 @@ from typing import Any
 
 from ms_slam_env import scenes
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.registry import SceneName
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.noise import NoiseConfig
 

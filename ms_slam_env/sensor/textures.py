@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float32
-from ms_slam_env.scenes.base import TexturedMesh
 from ms_slam_env.scenes.lighting import linear_to_srgb, srgb_to_linear
 from ms_slam_env.scenes.mesh_queries import face_cross
+from ms_slam_env.scenes.scene import TexturedMesh
 
 ENCODE_STEPS = 4096
 """Intervals of the linear-to-sRGB table."""

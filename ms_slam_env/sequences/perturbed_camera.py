@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor import ROLLING_ROWS, ChangingLight, NoiseConfig, RGBDSensor
 from ms_slam_env.sensor.casters import RayCaster, make_caster
-from ms_slam_env.sequences.perturbations.base import (
+from ms_slam_env.sequences.perturbations.movers import Mover, bodies_of
+from ms_slam_env.sequences.perturbations.optics import LinearLight
+from ms_slam_env.sequences.perturbations.perturbation import (
     FrameSelection,
     ImagePerturbation,
     LightPerturbation,
@@ -26,8 +28,6 @@ from ms_slam_env.sequences.perturbations.base import (
     WorldPerturbation,
     random_numbers,
 )
-from ms_slam_env.sequences.perturbations.movers import Mover, bodies_of
-from ms_slam_env.sequences.perturbations.optics import LinearLight
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 _METERING_WIDTH = 40  # images whose brightness is what an exposure control goes by

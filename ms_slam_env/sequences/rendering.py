@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor import FRAME_RATE_HZ, NoiseConfig, TrueView
-from ms_slam_env.sequences.perturbations.base import Perturbation, random_numbers
+from ms_slam_env.sequences.perturbations.perturbation import Perturbation, random_numbers
 from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamera
 from ms_slam_env.sequences.sequence import Frames, Sequence
 from ms_slam_env.sequences.trajectory import PoseInterpolation

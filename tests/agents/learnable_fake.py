@@ -8,7 +8,7 @@ import numpy as np
 from ms_slam_agents.learning_curve import read_curve as read_curve_file
 from ms_slam_agents.policy_file import PolicyFile
 
-from ms_slam_env.env.config import TargetConfig
+from ms_slam_env.env.env_config import TargetConfig
 
 NUM_ACTIONS = 7
 ENV_ID = "LearnableFake-v0"

@@ -7,7 +7,7 @@ from ms_slam_baselines.greedy import GreedyDivergence, distance_to_targets
 from small_env import small_env
 
 import ms_slam_env  # noqa: F401 -- registers the environments
-from ms_slam_env.env.config import TargetConfig
+from ms_slam_env.env.env_config import TargetConfig
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
 

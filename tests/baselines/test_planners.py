@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ms_slam_baselines import GreedyDivergence, MaxInformation, RandomWalk, Stationary
 
-from ms_slam_env.env.config import TargetConfig
+from ms_slam_env.env.env_config import TargetConfig
 from ms_slam_env.errors import InputError
 
 NUM_ACTIONS = 49

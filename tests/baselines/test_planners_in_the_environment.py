@@ -10,7 +10,7 @@ from ms_slam_baselines.greedy import PAPER_TARGETS
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.divergence import depth_divergence, intensity_divergence
-from ms_slam_env.env.config import TargetConfig
+from ms_slam_env.env.env_config import TargetConfig
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
 

@@ -17,7 +17,7 @@ from ms_slam_env.env.robot_view import TRUTH, PrivilegedView
 from ms_slam_env.env.simulation import Simulation
 from ms_slam_env.errors import InputError
 from ms_slam_env.robot import Embodiment
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.slam import SlamBackend
 
 PRIVILEGED = ("foresight", "oracle")

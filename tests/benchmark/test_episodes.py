@@ -95,7 +95,7 @@ def test_a_trained_policy_without_its_extra_says_what_to_install(monkeypatch):
 
 
 def test_planner_by_module_and_class_takes_options() -> None:
-    from ms_slam_env.env.config import EnvConfig
+    from ms_slam_env.env.env_config import EnvConfig
 
     class World:
         config = EnvConfig()
@@ -111,7 +111,7 @@ def test_planner_by_module_and_class_takes_options() -> None:
 
 
 def test_an_episode_moves_as_the_environment_does_by_default() -> None:
-    from ms_slam_env.env.config import EnvConfig
+    from ms_slam_env.env.env_config import EnvConfig
 
     assert SPEC.step_m == EnvConfig().step_m
     assert np.radians(SPEC.step_deg) == pytest.approx(EnvConfig().step_rad, abs=1e-12)

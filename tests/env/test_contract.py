@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 import ms_slam_env
 from ms_slam_env import scenes
 from ms_slam_env.env import ActiveSlamEnv
-from ms_slam_env.env.config import EnvConfig, make_config
+from ms_slam_env.env.env_config import EnvConfig, make_config
 from ms_slam_env.env.registry import OBSERVATIONS
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ms_slam_env.camera import pinhole
-from ms_slam_env.env.config import EnvConfig, RewardConfig, TargetConfig
 from ms_slam_env.env.coverage import CoverageGrid, Voxels
+from ms_slam_env.env.env_config import EnvConfig, RewardConfig, TargetConfig
 from ms_slam_env.env.reward import Outcome, reward_terms
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, so3_exp, transform_points

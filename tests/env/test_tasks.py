@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ms_slam_env import ENV_IDS, TASK_IDS, scenes
-from ms_slam_env.env.config import EnvConfig
+from ms_slam_env.env.env_config import EnvConfig
 from ms_slam_env.errors import InputError
 from ms_slam_env.tasks import OWN, Task, env_id_of, find_task
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ms_slam_env.evaluation.submaps import paths_by_submap, submap_errors
+from ms_slam_env.evaluation.submap_errors import paths_by_submap, submap_errors
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.metrics import ate_rmse
 

@@ -8,10 +8,10 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
+from ms_slam_env.robot.arm.arm_config import ArmConfig
 from ms_slam_env.robot.arm.cartesian_path import progress
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
 from ms_slam_env.robot.arm.clearance import ClearanceField
-from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.feasibility import DAMPING, LIMIT_MARGIN_RAD, MOST_STRETCH
 
 

@@ -12,7 +12,6 @@ from scipy import ndimage
 
 from ms_slam_env import scenes
 from ms_slam_env.geometry import check_pose
-from ms_slam_env.scenes.base import enclosed, floor_height, outside
 from ms_slam_env.scenes.free_space import FreeSpace
 from ms_slam_env.scenes.homes import home as home_module
 from ms_slam_env.scenes.homes.home import CAMERA_M, reachable_cells
@@ -20,6 +19,7 @@ from ms_slam_env.scenes.homes.ways import Ways
 from ms_slam_env.scenes.lighting import Lamp, RoomLight, mean_albedo
 from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross
 from ms_slam_env.scenes.mesh_scene import MIN_START_CLEARANCE_M
+from ms_slam_env.scenes.scene import enclosed, floor_height, outside
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import RoutePath
 

@@ -7,22 +7,22 @@ import pytest
 from ms_slam_env import scenes
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
-from ms_slam_env.scenes import base
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.scenes.mesh_scene import MIN_START_CLEARANCE_M, START_DEPTH_M
+from ms_slam_env.scenes.scene import Scene, TexturedMesh
 
 
 @pytest.fixture(scope="module", params=scenes.ROOMS)
-def scene(request: pytest.FixtureRequest) -> base.Scene:
+def scene(request: pytest.FixtureRequest) -> Scene:
     return _cached(request.param)
 
 
 @cache
-def _cached(name: str) -> base.Scene:
+def _cached(name: str) -> Scene:
     return scenes.make(name, 2)
 
 
-def _normals(mesh: base.TexturedMesh) -> np.ndarray:
+def _normals(mesh: TexturedMesh) -> np.ndarray:
     c = mesh.vertices[mesh.faces].astype(np.float64)
     n = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
     return n / np.linalg.norm(n, axis=1, keepdims=True)

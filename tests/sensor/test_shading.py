@@ -9,7 +9,7 @@ from box_scene import BoxScene
 
 from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.geometry import look_at
-from ms_slam_env.scenes.base import TexturedMesh
+from ms_slam_env.scenes.scene import TexturedMesh
 from ms_slam_env.sensor import NoiseConfig, NoNoise, RGBDSensor
 from ms_slam_env.sensor.textures import (
     linear_to_srgb,

@@ -9,7 +9,7 @@ import pytest
 from bag_files import COLOR, DEPTH, INFO, TRUTH, Messages, png, topics_of, write_bag
 
 from ms_slam_env.camera import Distortion, Intrinsics, xtion
-from ms_slam_env.camera.registration import ColorCamera, Registration
+from ms_slam_env.camera.depth_registration import ColorCamera, Registration
 from ms_slam_env.camera.undistortion import undistort_color
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError, InputWarning

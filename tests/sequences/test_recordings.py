@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.camera.registration import ColorCamera
+from ms_slam_env.camera.depth_registration import ColorCamera
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.sequences import associate, open_sequence, write_trajectory

@@ -11,14 +11,14 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.geometry import invert
 from ms_slam_env.robot.action_primitives import NUM_MOTIONS, decompose
+from ms_slam_env.robot.arm.arm_config import ArmConfig
 from ms_slam_env.robot.arm.base_placement import place_arm, reach_m, standing_chain
 from ms_slam_env.robot.arm.clearance import ClearanceField, LinkClearance
-from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.feasibility import LIMIT_MARGIN_RAD, Feasibility, FeasibilityResult
 from ms_slam_env.robot.arm.inverse_kinematics import solve_pose
 from ms_slam_env.robot.arm.model import load_arm
-from ms_slam_env.robot.base import Embodiment, HasClearance, MotionResult
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.robot.embodiment import Embodiment, HasClearance, MotionResult
+from ms_slam_env.scenes.scene import Scene
 
 
 def frame_times(duration_s: float, config: ArmConfig) -> Float64:

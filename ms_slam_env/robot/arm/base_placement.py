@@ -10,9 +10,9 @@ from ms_slam_env._runtime.arrays import Bool, Float64
 from ms_slam_env.errors import InputError, UnreachableError
 from ms_slam_env.geometry import invert, make_pose, so3_exp, transform_points
 from ms_slam_env.robot.action_primitives import decompose
+from ms_slam_env.robot.arm.arm_config import ArmConfig
 from ms_slam_env.robot.arm.chain import Chain, with_column
 from ms_slam_env.robot.arm.clearance import ClearanceField
-from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.feasibility import LIMIT_MARGIN_RAD, Feasibility
 from ms_slam_env.robot.arm.inverse_kinematics import (
     PITCHES,
@@ -28,7 +28,7 @@ from ms_slam_env.robot.arm.inverse_kinematics import (
     wrap_joints,
 )
 from ms_slam_env.robot.arm.model import ArmModel
-from ms_slam_env.scenes.base import Scene, enclosed, outside, words
+from ms_slam_env.scenes.scene import Scene, enclosed, outside, words
 
 COLUMN_RADIUS_M = 0.08
 """Radius of the column that carries a base above the floor."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.robot.arm.chain import Chain, segment_distance
-from ms_slam_env.robot.base import HasClearance
+from ms_slam_env.robot.embodiment import HasClearance
 from ms_slam_env.scenes.free_space import trilinear
 from ms_slam_env.scenes.mesh_scene import MeshScene
 

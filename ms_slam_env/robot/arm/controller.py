@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env.robot.arm.arm_config import ArmConfig
 from ms_slam_env.robot.arm.cartesian_path import CartesianPath
 from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.clearance import ClearanceField, ClearanceLimit, LinkClearance
-from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.feasibility import DAMPING, LIMIT_MARGIN_RAD
 from ms_slam_env.robot.arm.model import ArmModel
 

@@ -11,12 +11,12 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.geometry import relative_angle, transform_points
 from ms_slam_env.robot.arm.arm import ArmEmbodiment, frame_times
-from ms_slam_env.robot.arm.config import ArmConfig
+from ms_slam_env.robot.arm.arm_config import ArmConfig
 from ms_slam_env.robot.arm.controller import CONTROL_HZ, Controller, Plan, checked_ticks
 from ms_slam_env.robot.arm.dynamics import ArmDynamics, Imperfections, Motion
 from ms_slam_env.robot.arm.feasibility import MOST_STRETCH
-from ms_slam_env.robot.base import MotionResult
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.robot.embodiment import MotionResult
+from ms_slam_env.scenes.scene import Scene
 
 _SETTLE_S = 1.0  # before the first frame
 

@@ -11,7 +11,7 @@ from mujoco.batch import Batch
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.robot.arm.config import ArmNoise
+from ms_slam_env.robot.arm.arm_config import ArmNoise
 from ms_slam_env.robot.arm.model import ArmModel
 
 _INPUTS = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED)

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from ms_slam_env._runtime.arrays import Float64, Int32
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.geometry import invert
+from ms_slam_env.robot.arm.arm_config import ArmConfig
 from ms_slam_env.robot.arm.cartesian_path import PEAK_SPEED, progress
 from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.clearance import ClearanceField
-from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.feasibility_kernels import Grid, follow, start_deficits
 from ms_slam_env.robot.arm.ik_kernels import Arm, Scratch, vec6
 

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.robot.action_primitives import decompose
+from ms_slam_env.robot.arm.arm_config import ArmConfig
 from ms_slam_env.robot.arm.chain import Chain
 from ms_slam_env.robot.arm.clearance import ClearanceField
-from ms_slam_env.robot.arm.config import ArmConfig
 from ms_slam_env.robot.arm.feasibility import Feasibility
 
 _DAMPING = 1e-3  # of the pseudo-inverse, metres and radians

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.furniture.small_things import glaze, wood
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import fabric, interior, outdoor
 from ms_slam_env.scenes.textures.noise import hsv
 from ms_slam_env.scenes.textures.pictures import picture

@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import fabric, interior, pictures
 from ms_slam_env.scenes.textures.noise import hsv
 

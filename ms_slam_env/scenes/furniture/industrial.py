@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder, pick
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import industrial, interior
 from ms_slam_env.scenes.textures.noise import hsv
 

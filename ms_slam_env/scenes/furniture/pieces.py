@@ -6,10 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.furniture import small_things
 from ms_slam_env.scenes.furniture.small_things import wood
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import fabric, pictures
 from ms_slam_env.scenes.textures.noise import Image, grain, hsv
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import interior, pictures
 from ms_slam_env.scenes.textures.noise import Image, grain, hsv
 from ms_slam_env.scenes.textures.pictures import picture

@@ -11,9 +11,9 @@ import numpy as np
 from scipy import ndimage
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.room import Opening, Room, Window
+from ms_slam_env.scenes.scene import Rng
 
 Box = tuple[float, float, float, float]
 """Least x and y, greatest x and y of a footprint; or from where to where along and up a wall."""

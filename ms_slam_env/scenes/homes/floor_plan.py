@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.room import Room, Window
+from ms_slam_env.scenes.scene import Rng
 
 WALL_M = 0.12
 """Thickness of the walls between rooms."""

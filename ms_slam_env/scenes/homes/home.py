@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 from ms_slam_env._runtime.arrays import Bool, Float64, Int32
 from ms_slam_env.errors import InputError
 from ms_slam_env.scenes import mesh_cache
-from ms_slam_env.scenes.base import Rng, TexturedMesh
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.free_space import FreeSpace
 from ms_slam_env.scenes.homes.arrangement import Furnisher
@@ -36,6 +35,7 @@ from ms_slam_env.scenes.lighting import (
 from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross
 from ms_slam_env.scenes.mesh_scene import MeshScene, free_space_around, unit_rows
 from ms_slam_env.scenes.room import PANE, Room, Window
+from ms_slam_env.scenes.scene import Rng, TexturedMesh
 
 _KEY = 0.18
 _VARIETY = 5

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.furniture import decor
 from ms_slam_env.scenes.homes.arrangement import Arrangement, Furnisher, LocalDoor
@@ -19,6 +18,7 @@ from ms_slam_env.scenes.homes.floor_plan import (
 )
 from ms_slam_env.scenes.homes.furnishing import furnish
 from ms_slam_env.scenes.room import Opening, Room, floor_material, wall_colour, wall_material
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import fabric, interior
 from ms_slam_env.scenes.textures.noise import hsv
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ms_slam_env.errors import unknown
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.movers.car import car
 from ms_slam_env.scenes.movers.person import person
 from ms_slam_env.scenes.movers.shape import Joint, Part, Shape, box
+from ms_slam_env.scenes.scene import Rng
 
 MOVERS: dict[str, Callable[[Rng], Shape]] = {"box": box, "person": person, "car": car}
 """Kind to what builds one from random numbers."""

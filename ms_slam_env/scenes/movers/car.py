@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
 from ms_slam_env.scenes.movers.shape import Joint, Piece, Shape, assemble
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures.noise import grain, hsv
 
 _LENGTH_M = (3.9, 4.6)

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.movers.shape import Joint, Piece, Shape, assemble
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import fabric
 from ms_slam_env.scenes.textures.noise import grain, hsv
 

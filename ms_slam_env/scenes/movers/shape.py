@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ms_slam_env._runtime.arrays import Float32, Float64
-from ms_slam_env.scenes.base import Rng, TexturedMesh
 from ms_slam_env.scenes.builder import Geometry, MeshBuilder
 from ms_slam_env.scenes.lighting import hemispheres
 from ms_slam_env.scenes.mesh_queries import RayCaster
+from ms_slam_env.scenes.scene import Rng, TexturedMesh
 from ms_slam_env.scenes.textures import pictures
 from ms_slam_env.scenes.textures.noise import grain, hsv
 

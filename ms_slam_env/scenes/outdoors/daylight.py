@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import MeshBuilder
 from ms_slam_env.scenes.lighting import Lighting, SkyLight, Sun, light_and_expose
 from ms_slam_env.scenes.mesh_scene import SKY, LargeScene, SceneMaker
 from ms_slam_env.scenes.outdoors.plan import StreetPlan
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import outdoor
 
 RADIUS_M = 150.0

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder, pick
 from ms_slam_env.scenes.outdoors.plan import sides_of
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import fabric, interior, outdoor
 from ms_slam_env.scenes.textures.noise import hsv
 from ms_slam_env.scenes.textures.pictures import picture

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import Rng
 from ms_slam_env.scenes.builder import Material, MeshBuilder
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import interior, outdoor
 from ms_slam_env.scenes.textures.noise import grain, hsv
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from ms_slam_env.scenes.base import Rng
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures.noise import Field, Image, hsv, noise, shade
 
 

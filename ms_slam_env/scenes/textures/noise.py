@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from ms_slam_env._runtime.arrays import Image
-from ms_slam_env.scenes.base import Rng
+from ms_slam_env.scenes.scene import Rng
 
 Field = NDArray[np.float32]
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ms_slam_env.scenes.base import Rng
+from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures.noise import Image, grain, hsv, noise, shade, write
 
 

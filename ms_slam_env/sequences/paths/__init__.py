@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ms_slam_env._runtime.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from ms_slam_env.sequences.paths.base import CameraPath
+    from ms_slam_env.sequences.paths.camera_path import CameraPath
     from ms_slam_env.sequences.paths.handheld import HandheldPath
     from ms_slam_env.sequences.paths.paced import MotionSegments, UnevenPath
     from ms_slam_env.sequences.paths.placement import Placement, place_trajectory

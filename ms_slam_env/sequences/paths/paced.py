@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.scenes.base import Scene
-from ms_slam_env.sequences.paths.base import CameraPath, hand_tremor, resample
+from ms_slam_env.scenes.scene import Scene
+from ms_slam_env.sequences.paths.camera_path import CameraPath, hand_tremor, resample
 from ms_slam_env.sequences.paths.handheld import HandheldPath
 from ms_slam_env.sequences.paths.wandering import free_path
 from ms_slam_env.sequences.trajectory import PoseInterpolation

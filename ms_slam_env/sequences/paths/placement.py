@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose, make_pose, so3_exp
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 
 SCALES = tuple(round(1.0 - 0.05 * k, 2) for k in range(19))
 """Scales tried, from the largest to the smallest."""

@@ -11,8 +11,14 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.geometry import look_at
-from ms_slam_env.scenes.base import Scene
-from ms_slam_env.sequences.paths.base import CameraPath, frame_times, hand_tremor, resample, unit
+from ms_slam_env.scenes.scene import Scene
+from ms_slam_env.sequences.paths.camera_path import (
+    CameraPath,
+    frame_times,
+    hand_tremor,
+    resample,
+    unit,
+)
 from ms_slam_env.sequences.paths.wandering import RADIUS_M
 
 _SAMPLE_M = 0.1

@@ -10,8 +10,8 @@ import numpy as np
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Scene
-from ms_slam_env.sequences.paths.base import (
+from ms_slam_env.scenes.scene import Scene
+from ms_slam_env.sequences.paths.camera_path import (
     CameraPath,
     dense_path,
     frame_times,

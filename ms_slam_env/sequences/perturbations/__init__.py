@@ -10,7 +10,7 @@ from typing import Any
 
 from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env.config import from_dict
-from ms_slam_env.sequences.perturbations.base import Moment, Perturbation
+from ms_slam_env.sequences.perturbations.perturbation import Moment, Perturbation
 
 __all__ = ["PERTURBATIONS", "Moment", "Perturbation", "make_perturbation"]
 

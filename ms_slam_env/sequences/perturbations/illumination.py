@@ -11,13 +11,13 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.scenes.movers.shape import Shape
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor import ChangingLight
-from ms_slam_env.sequences.perturbations.base import LightPerturbation, random_numbers
 from ms_slam_env.sequences.perturbations.movers import Track
 from ms_slam_env.sequences.perturbations.moving_objects import Places
+from ms_slam_env.sequences.perturbations.perturbation import LightPerturbation, random_numbers
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 _BULB = Shape("box", (), radius_m=0.15, length_m=0.1, width_m=0.1, height_m=0.05, depth_m=0.05)

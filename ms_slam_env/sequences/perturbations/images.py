@@ -12,7 +12,11 @@ from scipy import ndimage
 
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.sequences.perturbations.base import ImagePerturbation, Moment, random_numbers
+from ms_slam_env.sequences.perturbations.perturbation import (
+    ImagePerturbation,
+    Moment,
+    random_numbers,
+)
 
 _ATTEMPTS = 10_000
 _EDGE_JUMP = 0.05  # of a depth edge: neighbours differ by more than this share of the nearer one

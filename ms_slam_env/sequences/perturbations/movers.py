@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import LightProbe
 from ms_slam_env.scenes.movers.shape import Joint, Shape
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor import Body
 
 _SPACING_M = 0.02

@@ -12,11 +12,11 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Scene
 from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.scenes.movers import MOVERS, Shape, make_mover
-from ms_slam_env.sequences.perturbations.base import WorldPerturbation, random_numbers
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sequences.perturbations.movers import Mover, Track, round_track, straight_track
+from ms_slam_env.sequences.perturbations.perturbation import WorldPerturbation, random_numbers
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 _TRIES = 4000

@@ -13,7 +13,7 @@ from ms_slam_env.camera import Distortion
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.geometry import make_pose
 from ms_slam_env.sensor import NoiseConfig
-from ms_slam_env.sequences.perturbations.base import (
+from ms_slam_env.sequences.perturbations.perturbation import (
     FrameSelection,
     MotionPerturbation,
     OpticalPerturbation,

@@ -10,7 +10,7 @@ import numpy as np
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.camera.registration import ColorCamera
+from ms_slam_env.camera.depth_registration import ColorCamera
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.geometry import check_pose, invert, pose_from_quaternion
 

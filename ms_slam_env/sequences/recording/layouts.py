@@ -13,8 +13,8 @@ import numpy as np
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.input_files import is_named, read_json
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.camera.depth_registration import ColorCamera
 from ms_slam_env.camera.image_files import image_size
-from ms_slam_env.camera.registration import ColorCamera
 from ms_slam_env.errors import InputError, InputWarning, unknown
 from ms_slam_env.sequences.recording.bags import SUFFIXES, Topics, is_bag, open_bag
 from ms_slam_env.sequences.recording.euroc import is_euroc, open_euroc

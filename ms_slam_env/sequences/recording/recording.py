@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, parse_image_size
+from ms_slam_env.camera.depth_registration import ColorCamera, Registration
 from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.camera.image_files import read_color, read_depth
 from ms_slam_env.camera.image_size import Crop
-from ms_slam_env.camera.registration import ColorCamera, Registration
 from ms_slam_env.camera.undistortion import undistort_color, undistort_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.sequence import Frames, Sequence

@@ -18,7 +18,7 @@ from scipy.optimize import differential_evolution, minimize
 
 from ms_slam_env._runtime.arrays import Float32, Float64, UInt8
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.camera.registration import Registration
+from ms_slam_env.camera.depth_registration import Registration
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import ArrayOf, ListOf
 from ms_slam_env.slam.slam_backend import TrackResult

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.geometry import look_at, relative_angle
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 
 _SAMPLES_PER_HOP = 40
 _TREMOR_M = 0.002

@@ -17,7 +17,7 @@ from ms_slam_env._runtime.arrays import Float64, Int64
 from ms_slam_env.camera import Distortion, Intrinsics, RGBDFrame
 from ms_slam_env.camera.distortion import NO_DISTORTION
 from ms_slam_env.errors import InputError
-from ms_slam_env.scenes.base import Scene
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor import ChangingLight
 from ms_slam_env.sequences.perturbations.movers import Mover
 from ms_slam_env.sequences.trajectory import PoseInterpolation
