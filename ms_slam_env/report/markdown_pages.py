@@ -22,6 +22,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import shlex
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -125,7 +126,13 @@ def _inserted(what: str, folder: Path, warned: set[Path]) -> str:
     parts.append(table.as_markdown())
     if options.get("made_by") == "yes":
         parts.append(made_by(results.provenance, results.rows))
-    return "\n".join(parts).rstrip("\n")
+    return "\n".join(_wrapped(line) for line in "\n".join(parts).rstrip("\n").split("\n"))
+
+
+def _wrapped(line: str) -> str:
+    """A line of a note on lines of at most 100 characters; rows of tables stay as they are."""
+    is_row = line.startswith("|")
+    return line if is_row else textwrap.fill(line, 100, break_long_words=False)
 
 
 def _chosen(results: Results, which: str) -> Table:

@@ -41,6 +41,16 @@ def test_a_table_is_written_between_its_comments(clone: Path) -> None:
     assert main([*arguments, "--check"]) == 0
 
 
+def test_a_long_note_is_wrapped_and_a_long_row_is_not(clone: Path) -> None:
+    note, name = "A word. " * 20, "x" * 120
+    tables = [make_table(["planner"], [{"planner": name}], note=note)]
+    write_results(clone / "docs/results/x/results.json", "x", "X", "About.", tables)
+    lines = with_tables(PAGE.format("x", ""), clone / "docs/results").split("\n")
+    assert f"| {name} |" in lines
+    assert max(len(line) for line in lines if not line.startswith("|")) <= 100
+    assert " ".join(lines).count("A word.") == 20
+
+
 def test_age_and_command_stand_with_the_table(clone: Path) -> None:
     path = clone / "docs/results/x/results.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"results_version": 1}))
