@@ -75,3 +75,19 @@ def test_a_buffer_is_the_arrays_own_memory():
     assert kept.any()
     assert not buffer.array.numpy().any()
     assert not buffer.look().any()
+
+
+@pytest.mark.parametrize("dtype", [wp.float32, wp.int32, wp.vec3, wp.mat44])
+@pytest.mark.parametrize("device", wp.get_devices(), ids=str)
+@pytest.mark.parametrize("by_assigning", [False, True])
+def test_fewer_values_are_broadcast_on_every_device(dtype, device, by_assigning) -> None:
+    buffer = HostDeviceBuffer((4, 3), dtype, str(device))
+    if by_assigning:  # as on any device that is not the CPU
+        buffer._staged, buffer._memory = buffer.read(), None
+    shape = buffer.read().shape
+    values = np.arange(4).reshape(4, *[1] * (len(shape) - 1))
+    buffer.write(values)
+    assert np.array_equal(buffer.read(), np.broadcast_to(values, shape))
+    assert np.array_equal(buffer.array.numpy(), np.broadcast_to(values, shape))
+    with pytest.raises(ValueError, match="broadcast"):
+        buffer.write(np.zeros((5, *shape[1:]), dtype=int))

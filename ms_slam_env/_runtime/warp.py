@@ -111,14 +111,20 @@ class HostDeviceBuffer:
 
     def __init__(self, shape: int | tuple[int, ...], dtype: Any, device: str) -> None:
         self.array = wp.zeros(shape, dtype=dtype, device=device)
-        self._memory: NDArray[Any] | None = None
-        if wp.get_device(device).is_cpu:
-            self._memory = self.array.numpy()
+        values = self.array.numpy()
+        self._memory: NDArray[Any] | None = values if wp.get_device(device).is_cpu else None
+        self._staged: NDArray[Any] = values  # on its way to another device
 
     def write(self, values: ArrayLike) -> None:
-        """Set all values."""
+        """Set all values; on every device they are broadcast to the shape of the array.
+
+        Raises:
+            ValueError: values that cannot be broadcast to it.
+        """
         if self._memory is None:
-            self.array.assign(values)
+            # `assign` would fill the beginning of the array with fewer values, and say nothing.
+            np.copyto(self._staged, values)
+            self.array.assign(self._staged)
         else:
             np.copyto(self._memory, values)
 
