@@ -34,6 +34,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import registry
 from ms_slam_env.scenes import registry as scene_registry
 from ms_slam_env.sequences import naming, perturbations
+from ms_slam_env.sequences.perturbations.optics import MotionBlur
 from ms_slam_env.tasks import TASKS
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
@@ -179,7 +180,7 @@ def test_a_sequence_is_named_with_scene_and_perturbation(module):
     assert isinstance(named, naming.SequenceName)
     assert (named.scene, named.seed, named.noise) == (f"{MODULE}:dim_table", 1000, "kinect")
     assert named.perturbations[0] == module.Fog(density=0.25)
-    assert isinstance(named.perturbations[1], perturbations.MotionBlur)
+    assert isinstance(named.perturbations[1], MotionBlur)
     naming.check_sequence(text)
 
 

@@ -101,7 +101,7 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     assert (written["kind"], written["results_version"]) == ("run", RESULTS_VERSION)
     assert [chart["name"] for chart in written["charts"]] == ["path", "error", "alignment", "cost"]
     page = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
-    named = re.findall(r"`(\w+)`", re.findall(r"`metrics.json` \(([^)]*)\)", page)[0])
+    named = re.findall(r"`(\w+)`", re.findall(r"`metrics.json` \| (.*) and more", page)[0])
     assert named
     assert set(named) <= written.keys()
     path = written["charts"][0]

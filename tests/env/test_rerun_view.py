@@ -65,7 +65,7 @@ def test_render_mode_human_shows_each_episode_anew(tmp_path, monkeypatch):
         made.append(EpisodeView(env, next(paths)))
         return made[-1]
 
-    monkeypatch.setattr(make, "EpisodeView", to_file)
+    monkeypatch.setattr(make, "load_reference", lambda _: to_file)
     env = gym.make(FREE, scene="table", image_size="80x60", render_mode="human")
     env.reset(seed=0)
     env.step(14)

@@ -87,7 +87,7 @@ def test_command_writes_the_picture(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(stills.PICTURES, "arm", draw)
     words = ["arm", "--out", str(tmp_path / "deep")]
     assert run_script(Options, save, check_out_folder, words) == 0
-    image = cv2.imread(str(tmp_path / "deep" / "arm.png"))
+    image = cv2.imread(str(tmp_path / "deep" / "arm.webp"))
     assert image.shape == (18 + 24 + 4, 3 * 36, 3)
     assert image[18:].std() > 5
     assert run_script(Options, save, check_out_folder, ["leg"]) == 2
