@@ -28,7 +28,7 @@ Choose = Callable[
 """Observations (B, k), masks (B, n), a generator an episode, and which episodes begin (B,), to
 actions (B,) or (B, numbers)."""
 
-_STREAM = 1  # of an episode's seed, for who chooses; the environment draws from the seed itself
+_STREAM = 1  # stream of an episode's seed for the policy; the environment uses the seed itself
 
 
 class FixedEpisodes(gym.Wrapper[Any, Any, Any, Any]):
