@@ -20,15 +20,15 @@ BLOCKED = -1e9  # logit of a blocked action; -inf would make NaN of its entropy
 
 
 class Network(nn.Module):
-    """Two hidden layers for the policy and two for the value, behind a memory if there is one.
+    """Two hidden layers for the policy and two for the value, after an optional memory.
 
-    With ``candidates`` numbers of each action at the end of an observation, one encoder looks at
-    each action's, the layers see the state and the mean and the largest of what it makes of them,
-    and one score is given for each: in another order the actions have the same probabilities.
-    With ``quantiles`` there is no value: each action has so many quantiles of the return.
-    With an ``image`` (channels, rows, columns) at the end of an observation, convolutions look at
-    it, and the layers see the state and what these make of it.
-    While it trains, a share ``dropout`` of what the layers see is zero, drawn anew each time.
+    With ``candidates`` values per action at the end of an observation, a shared encoder processes
+    each action's values, the layers get the state and the mean and maximum of the encodings, and
+    each action gets a score, so that the order of the actions does not matter.
+    With ``quantiles`` there is no value: each action has this number of quantiles of the return.
+    With an ``image`` (channels, rows, columns) at the end of an observation, the layers get the
+    state and the output of convolutions on the image.
+    In training, a random share ``dropout`` of the layers' input is set to zero.
 
     The names of the parameters are Stable-Baselines3's, ``memory.*``, ``encoder.*``, ``score.*``,
     ``image.*``.

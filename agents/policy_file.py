@@ -280,7 +280,7 @@ def write_policy(path: Path, policy: PolicyFile) -> None:
     """Write a policy file, as `output_files.write_bytes` does.
 
     Raises:
-        InputError: tensors that do not fit the metadata, or numbers too large or not finite.
+        InputError: tensors that do not fit the metadata, or invalid numbers.
     """
     _check_values(path, {k: _at_least_single(v) for k, v in policy.tensors.items()})
     shapes = tensor_shapes(policy.metadata, STEP in policy.tensors)
