@@ -259,7 +259,7 @@ class Run(TrainingRun):
     Args:
         args: of the training.
         venv: normalised environments.
-        file: to go on from, if there is one.
+        file: policy file to resume from, if any.
     """
 
     (algorithm,) = Args.algorithms

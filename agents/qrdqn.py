@@ -214,7 +214,7 @@ class Run(TrainingRun):
     Args:
         args: of the training.
         venv: environments, not normalised.
-        file: to go on from, if there is one.
+        file: policy file to resume from, if any.
 
     Raises:
         InputError: a policy to begin with that is no QR-DQN's.

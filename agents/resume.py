@@ -189,7 +189,7 @@ def say_changes(saved: Mapping[str, Any], args: Problem) -> None:
 
 
 def check_new(out: Path, *names: str) -> None:
-    """Refuse a new run where files of these names show that there is one already.
+    """Refuse a new run in a folder that already has files of these names.
 
     Raises:
         InputError: there is one.
@@ -205,7 +205,7 @@ def check_kept(
     names: Iterable[str],
     was: str = "was trained with",
 ) -> None:
-    """Refuse to go on with a run under options that would make it another one.
+    """Refuse to resume a run with options that would make it a different one.
 
     What a run of earlier does not say, it had as an option is by default.
 
@@ -227,7 +227,7 @@ def check_kept(
 
 
 def check_steps_left(path: Path, done: int, total: int) -> None:
-    """Refuse to go on with a run that has all its steps.
+    """Refuse to resume a run that has made all its steps.
 
     Raises:
         InputError: no steps are left.

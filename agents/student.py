@@ -99,7 +99,7 @@ class Student:
         return {"loss": float(losses.mean()), "probability": float(np.nanmean(probabilities))}
 
     def file(self, timesteps: int, minutes: float) -> PolicyFile:
-        """The policy as it is now."""
+        """The current policy."""
         args = self.args
         metadata = metadata_of(
             args,

@@ -142,7 +142,7 @@ class Supervisor(BaseCallback):
         write_policy(self.args.out / LATEST, self.policy_file())
 
     def policy_file(self) -> PolicyFile:
-        """The policy as it is now, with the state of the optimiser."""
+        """The current policy, with the state of the optimiser."""
         space = self.training_env.observation_space
         assert space.shape is not None
         metadata = metadata_of(

@@ -220,7 +220,7 @@ class Run(TrainingRun):
 
     Args:
         args: of the training.
-        file: to go on from, if there is one.
+        file: policy file to resume from, if any.
 
     Raises:
         InputError: a policy to begin with that is of another network.

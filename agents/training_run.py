@@ -61,7 +61,7 @@ class TrainingRun(ABC):
         args: of the training.
         observations: the environments' space.
         actions: the environments' space.
-        file: to go on from, if there is one.
+        file: policy file to resume from, if any.
 
     Raises:
         InputError: an action of several parts.
@@ -99,7 +99,7 @@ class TrainingRun(ABC):
 
     @abstractmethod
     def tensors(self) -> Tensors:
-        """The policy as it is now, with the state of the optimiser."""
+        """The current policy, with the state of the optimiser."""
 
     def metadata(self) -> Metadata:
         """Metadata of the current policy."""
@@ -117,7 +117,7 @@ class TrainingRun(ABC):
         )
 
     def file(self) -> PolicyFile:
-        """The policy as it is now, with the state of the optimiser."""
+        """The current policy, with the state of the optimiser."""
         return PolicyFile(self.metadata(), self.tensors())
 
     def learn(self, curve: Curve, validation: VecEnv) -> signal.Signals | None:
