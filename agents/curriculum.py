@@ -1,11 +1,11 @@
-"""A curriculum: stages of a training, from easy to the problem itself, with drawn light and noise.
+"""Curricula: stages of a training, from easy to the full problem, with random light and noise.
 
     - {until: 0.2, scenes: [table], step_m: 0.06, step_deg: 6, episode_steps: 50}
     - {until: 0.6, above: 20, noise: [0.5, 1.5]}
     - {perturbations: {illumination: {dim: [0, 0.6], lamp: [0, 1]}}}
 
-Such a file is option ``--curriculum`` of the trainers. Where an episode starts is drawn in every
-stage, as always. Validation knows no stages: it is the problem itself.
+Pass such a file as ``--curriculum`` to a trainer. The start of an episode is drawn in every stage,
+as always. Validation always uses the full problem.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from ms_slam_env.sequences.perturbations import make_perturbation
 P = TypeVar("P")
 Range = tuple[float, float]
 Between = Callable[[float, float], float]
-"""Takes a number between two, as ``rng.uniform`` does."""
+"""Draws a number between two, like ``rng.uniform``."""
 
 _STREAM = 2  # of an episode's seed; the environment draws from the seed itself
 
 
 @dataclass(frozen=True)
 class Stage(Checked):
-    """A part of a training; what it does not say is as the problem has it.
+    """A stage of a training; options that it does not set are the problem's.
 
     Attributes:
-        until: share of the training's steps at which it ends; None: at the end, or by ``above``.
-        above: return on the validation episodes at which it ends before that.
+        until: share of the training's steps at which the stage ends; None: at the end of training,
+            or by ``above``.
+        above: return on the validation episodes at which the stage ends earlier.
         scenes: as the trainers' option.
         scene_seeds: as the trainers' option.
         episode_steps: as the trainers' option.
         step_m: as the trainers' option.
         step_deg: as the trainers' option.
         frames_per_action: as the trainers' option.
-        noise: strength of the sensor's noise, drawn for each episode between two numbers.
-        perturbations: name to options; two numbers stand for one between them, drawn for each
-            episode.
+        noise: range of the strength of the sensor noise, drawn for each episode.
+        perturbations: name to options; a pair of numbers is a range, drawn from for each episode.
     """
 
     until: float | None = bounded(None, 0, 1)
@@ -61,25 +61,25 @@ class Stage(Checked):
     perturbations: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def problem(self, args: P) -> P:
-        """A trainer's options as they are in this stage."""
+        """A trainer's options in this stage."""
         own = ("scenes", "scene_seeds", "episode_steps", "step_m", "step_deg", "frames_per_action")
         given = {name: getattr(self, name) for name in own}
         return replace(args, **{n: v for n, v in given.items() if v is not None})  # type: ignore
 
     def is_over(self, share: float, score: float) -> bool:
-        """Whether it has ended after a share of the steps, with a return on validation."""
+        """Whether the stage has ended, given the share of steps and the validation return."""
         by_share = self.until is not None and share >= self.until
         return by_share or (self.above is not None and score > self.above)
 
     def draw(self, between: Between) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
-        """Options of ``gym.make`` and perturbations of an episode."""
+        """Draw the options of ``gym.make`` and the perturbations of an episode."""
         noise = {} if self.noise is None else {"noise": {"name": "kinect", "strength": self.noise}}
         drawn = _drawn({"options": noise, "perturbations": self.perturbations}, between)
         return drawn["options"], list(drawn["perturbations"].items())
 
 
 def _drawn(value: Any, between: Between) -> Any:
-    """``value`` with a number for each pair of numbers."""
+    """Replace each pair of numbers in ``value`` by a number drawn between them."""
     if isinstance(value, Mapping):
         return {name: _drawn(part, between) for name, part in value.items()}
     is_range = isinstance(value, (tuple, list)) and len(value) == 2
@@ -87,10 +87,10 @@ def _drawn(value: Any, between: Between) -> Any:
 
 
 def read_curriculum(path: Path) -> tuple[Stage, ...]:
-    """The stages in a file.
+    """Read the stages from a file.
 
     Raises:
-        InputError: no such file, or one with something else in it.
+        InputError: no such file, or one that is not a curriculum.
     """
     try:
         content = load_yaml(read_text(path, "curriculum"))
@@ -128,9 +128,9 @@ def _stage(content: Any, name: str) -> Stage:
 def stage_now(
     stages: Sequence[Stage], steps: int, points: Sequence[Mapping[str, Any]], total: int
 ) -> int:
-    """The stage after ``steps`` of ``total``, as validation went; the same for a run that goes on.
+    """The stage after ``steps`` of ``total``, given the validations; the same for a resumed run.
 
-    A validation ends one stage at most, and the one before training none.
+    A validation ends at most one stage; the one before training ends none.
     """
     stage = 0
     scores = [(p["timesteps"], p["return"]) for p in points if 0 < p["timesteps"] <= steps]
@@ -142,12 +142,12 @@ def stage_now(
 
 
 class Staged(gym.Wrapper[Any, Any, Any, Any]):
-    """An environment that is made anew for an episode of another stage, or with other draws.
+    """An environment that is rebuilt for an episode of another stage, or with other draws.
 
     Args:
-        stages: of the training.
-        args: of the training.
-        make: makes an environment of options, and of more options of ``gym.make``.
+        stages: stages of the training.
+        args: options of the training.
+        make: makes an environment from a problem and further options of ``gym.make``.
     """
 
     def __init__(self, stages: Sequence[Stage], args: Any, make: Any) -> None:
@@ -159,21 +159,22 @@ class Staged(gym.Wrapper[Any, Any, Any, Any]):
         self._rng = np.random.default_rng(args.seed)
 
     def enter_stage(self, stage: int) -> None:
-        """Be of another stage from the next reset on."""
+        """Switch to another stage at the next reset."""
         self.stage = stage
 
     def check(self) -> None:
         """Make the environment of every stage.
 
         Raises:
-            InputError: a stage that cannot be made, or that has other observations or actions.
+            InputError: a stage whose environment cannot be made, or differs in observations or
+                actions.
         """
         for stage, one in enumerate(self.stages):
             self.stage = stage
             self._enter(*one.draw(self._rng.uniform))
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode of the stage."""
+        """Start an episode of the current stage."""
         if seed is not None:
             self._rng = np.random.default_rng([seed, _STREAM])
         drawn = self.stages[self.stage].draw(self._rng.uniform)

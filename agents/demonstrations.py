@@ -1,4 +1,4 @@
-"""Episodes in which a planner says what it would do, for a policy to learn from."""
+"""Episodes labelled with a planner's actions, for imitation learning."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _ARRAYS = {"observations": 2, "masks": 2, "preferences": 2, "rewards": 1, "is_tr
 
 @dataclass(frozen=True)
 class Task:
-    """One episode to be played.
+    """One episode to play.
 
     Attributes:
-        path: the file that it becomes.
+        path: output file.
         env_id: of the environment.
-        options: of ``gym.make``, which a process keeps from one episode to the next.
+        options: of ``gym.make``; a process keeps its environment while they stay the same.
         seed: of the episode.
         teacher: a planner, ``NAME,option=value,...``.
-        policy: file of the policy that acts; None: the teacher does.
-        share: of the episode's decisions that are the teacher's where a policy acts.
-        through: planner with the option ``path`` that the policy acts through; of decisions that
-            the teacher does not weigh nothing is learnt then. None: the policy acts by itself.
+        policy: file of the policy that acts; None: the teacher acts.
+        share: share of the decisions that the teacher makes when a policy acts.
+        through: planner with the option ``path`` through which the policy acts; decisions that the
+            teacher does not rate are then not learned from. None: the policy acts by itself.
     """
 
     path: Path
@@ -50,15 +50,15 @@ class Task:
 
 @dataclass(frozen=True)
 class Demonstration:
-    """What was seen in T steps, and what the teacher would have done.
+    """Observations of T steps, and the actions that the teacher would have taken.
 
     Attributes:
         observations: (T, k) float16.
-        masks: (T, n) bool, the actions that were possible.
-        preferences: (T, n) float16, probabilities of the actions as the teacher weighs them; all
-            zero where nothing is to be learnt.
-        rewards: (T,) of the actions that were taken.
-        is_tracked: (T,) bool, whether SLAM knew where it was.
+        masks: (T, n) bool, the possible actions.
+        preferences: (T, n) float16, the teacher's probabilities of the actions; all zero for steps
+            that are not learned from.
+        rewards: (T,) of the actions taken.
+        is_tracked: (T,) bool, whether SLAM knew its pose.
     """
 
     observations: NDArray[np.float16]
@@ -68,17 +68,17 @@ class Demonstration:
     is_tracked: NDArray[np.bool_]
 
     def write(self, path: Path) -> None:
-        """Write a compressed NumPy archive, whole or not at all."""
+        """Write a compressed NumPy archive atomically."""
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **{name: getattr(self, name) for name in _ARRAYS})
         write_bytes(path, buffer.getvalue())
 
     @staticmethod
     def read(path: Path) -> Demonstration:
-        """Read what ``write`` wrote; nothing in the file is executed.
+        """Read a file written by ``write``; nothing in it is executed.
 
         Raises:
-            InputError: no such file, or another one.
+            InputError: no such file, or one that is not a demonstration.
         """
         try:
             check_file(path, "demonstration", MAX_MESH_BYTES)
@@ -88,14 +88,14 @@ class Demonstration:
                 made = Demonstration(**{name: found[name] for name in _ARRAYS})
             lengths = {len(getattr(made, name)) for name in _ARRAYS}
             kinds = {name: getattr(made, name).ndim for name in _ARRAYS}
-        except Exception as error:  # whatever a damaged archive makes its readers raise
+        except Exception as error:  # a damaged archive can raise anything
             raise InputError(f"{path} is no demonstration: {error}") from None
         if len(lengths) != 1 or kinds != _ARRAYS:
             raise InputError(f"{path} is no demonstration: arrays that do not fit each other")
         return made
 
     def returns(self, gamma: float) -> NDArray[np.float64]:
-        """Discounted sums (T,) of the rewards from each step on, nothing after the last."""
+        """Discounted sums (T,) of the rewards from each step on, 0 after the last."""
         sums = np.zeros(len(self.rewards) + 1)
         for t in range(len(self.rewards) - 1, -1, -1):
             sums[t] = self.rewards[t] + gamma * sums[t + 1]
@@ -106,10 +106,10 @@ _ENVS: dict[Any, gym.Env[Any, Any]] = {}
 
 
 def play(task: Task) -> Path:
-    """Play an episode and write it; return its path.
+    """Play an episode, write it, and return its path.
 
-    The teacher is asked at every step and told what was done instead (DAgger's queries of the
-    expert, Ross et al., AISTATS 2011).
+    The teacher is queried at every step and told which action was taken instead (DAgger, Ross et
+    al., AISTATS 2011).
     """
     key = (task.env_id, repr(task.options))  # a reward's weights are a dictionary
     if key not in _ENVS:
@@ -152,7 +152,7 @@ def play(task: Task) -> Path:
 
 
 def _actor(task: Task, env: Any, seed: int) -> Planner | None:
-    """The planner that the policy acts through, ready; None where the teacher acts."""
+    """The initialized planner through which the policy acts; None where the teacher acts."""
     if task.policy is None:
         return None
     actor = make_planner(task.through or "policy", env, seed, path=str(task.policy))

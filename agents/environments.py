@@ -1,4 +1,4 @@
-"""The environments that policies are trained and judged in."""
+"""Environments for training and validating policies."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws f
 def make_env(
     args: Problem, split: str, seeds: Sequence[int] = (), environment: int = 0
 ) -> gym.Env[Any, Any]:
-    """Build one environment; with ``seeds`` it plays those episodes only.
+    """Build one environment; with ``seeds`` it plays only those episodes.
 
-    One to train in follows the curriculum, if there is one, and is of the world that its number
-    among the parallel ones has.
+    A training environment follows the curriculum, if there is one; its number among the parallel
+    environments selects its task.
     """
     if split == "train":
         args = world_of(args, environment)
@@ -77,27 +77,27 @@ def problem_options(args: Problem, split: str) -> dict[str, Any]:
         "split": split,
         "num_scene_seeds": args.scene_seeds,
         "observation": args.observation,
-        "frame_divergences": False,  # nobody reads them here
+        "frame_divergences": False,  # not used here
         **few,
         **env_options(args),
     }
 
 
 def first_seed(seed: int, steps: int = 0) -> int:
-    """Seed of the first of a training's environments, whose others have those that follow.
+    """Seed of the first parallel environment of a training; the others have the seeds after it.
 
-    Far from what other seeds have, and from what this one had before its first ``steps`` steps:
-    with the seeds themselves two trainings would meet nearly the same episodes.
+    Far from those of other training seeds, and from those that this one used before ``steps``
+    steps: with consecutive seeds two trainings would play nearly the same episodes.
     """
     return int(np.random.SeedSequence([seed, steps]).generate_state(1)[0]) >> 2
 
 
 @contextmanager
 def opened(venv: VecEnv) -> Iterator[VecEnv]:
-    """Close the environments at the end, even where the process of one has ended.
+    """Close the environments at the end, even if the process of one has died.
 
     Raises:
-        RuntimeError: one has ended, in place of what the connection to it says.
+        RuntimeError: a process has died, instead of its connection error.
     """
     try:
         yield venv
@@ -109,7 +109,7 @@ def opened(venv: VecEnv) -> Iterator[VecEnv]:
 
 
 def check_problem(args: Problem) -> None:
-    """Refuse what no environment can be made of.
+    """Refuse a problem for which no environment can be made.
 
     Raises:
         InputError: an unknown environment, or options that it refuses.
@@ -129,7 +129,7 @@ def check_problem(args: Problem) -> None:
 
 
 def say_problem(args: Problem) -> None:
-    """Print where a policy is trained, before anything is done."""
+    """Print the problem at the start of a training."""
     also = getattr(args, "also", ())
     worlds = [world_of(args, k) for k in range(1 + len(also))]
     places = [f"{world.env_id} ({', '.join(world.scenes)})" for world in worlds]
@@ -140,7 +140,7 @@ def say_problem(args: Problem) -> None:
 
 
 def _spaces_in(args: Problem, split: str) -> tuple[Any, Any]:
-    """Of observations and actions, from an environment that is made for it."""
+    """Observation and action space, from an environment made for this purpose."""
     try:
         env = make_env(args, split)
         if isinstance(env, Staged):
@@ -159,7 +159,7 @@ def _spaces_in(args: Problem, split: str) -> tuple[Any, Any]:
 
 
 def env_options(args: Problem) -> dict[str, Any]:
-    """Options of the environment that a policy depends on, where not the environment's own."""
+    """The environment options that a policy depends on, where they differ from the defaults."""
     step_rad = None if args.step_deg is None else math.radians(args.step_deg)
     options = {"embodiment": args.embodiment, "step_m": args.step_m, "step_rad": step_rad}
     return {name: value for name, value in options.items() if value is not None}

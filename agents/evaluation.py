@@ -28,11 +28,11 @@ Choose = Callable[
 """Observations (B, k), masks (B, n), a generator an episode, and which episodes begin (B,), to
 actions (B,) or (B, numbers)."""
 
-_STREAM = 1  # of an episode's seed, for who chooses; the environment draws from the seed itself
+_STREAM = 1  # stream of an episode's seed for the policy; the environment uses the seed itself
 
 
 class FixedEpisodes(gym.Wrapper[Any, Any, Any, Any]):
-    """Plays the same seeded episodes each time round; ``restart`` goes back to the first."""
+    """Plays a fixed list of seeded episodes; ``restart`` goes back to the first."""
 
     def __init__(self, env: gym.Env[Any, Any], seeds: Sequence[int]) -> None:
         super().__init__(env)
@@ -40,13 +40,13 @@ class FixedEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         self._next = 0
 
     def restart(self) -> None:
-        """Let the next reset play the first episode."""
+        """Make the next reset play the first episode."""
         self._next = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start the next episode of the list, whatever ``seed`` says."""
+        """Start the next episode of the list, ignoring ``seed``."""
         seed = self.seeds[self._next % len(self.seeds)]
         self._next += 1
         return self.env.reset(seed=seed, options=options)
@@ -55,14 +55,14 @@ class FixedEpisodes(gym.Wrapper[Any, Any, Any, Any]):
 def evaluate(
     venv: VecEnv, num_episodes: int, choose: Choose, played_one: Callable[[], Any] | None = None
 ) -> dict[str, Any]:
-    """Play every validation episode once; means over episodes, and ``returns`` one by one.
+    """Play every validation episode once; return means, and each episode's return in ``returns``.
 
-    What an episode draws depends on its seed alone: the same network has the same score however
-    often, and in however many processes, it is evaluated; two networks meet the same luck.
+    Random draws in an episode depend on its seed alone. A network has the same score in every
+    evaluation and with any number of processes, and all networks get the same random numbers.
 
     Args:
-        venv: of ``FixedEpisodes``.
-        num_episodes: in all environments together, as many as these have.
+        venv: parallel ``FixedEpisodes``.
+        num_episodes: number of episodes in all environments together.
         choose: see ``Choose``.
         played_one: called after each episode.
     """
@@ -108,7 +108,7 @@ def _stream(seed: int) -> np.random.Generator:
 def evaluate_policy(
     venv: VecEnv, num_episodes: int, policy: Policy, deterministic: bool = False
 ) -> dict[str, Any]:
-    """``evaluate`` a trained policy that draws its actions, or takes the most probable."""
+    """``evaluate`` a trained policy that samples its actions, or takes the most probable."""
 
     memory = policy.empty_memory(venv.num_envs)
 
@@ -131,8 +131,8 @@ def evaluate_policy(
 def paired_gain(returns: Sequence[float], reference: Sequence[float]) -> dict[str, float]:
     """Mean gain over a reference on the same episodes, and its standard error.
 
-    Episodes differ far more among themselves than planners do on one of them: the pairs tell
-    sooner whether a policy is better.
+    Episodes differ far more from each other than planners do on one episode, so pairs need fewer
+    episodes to show whether a policy is better.
     """
     gain = np.subtract(returns, reference)
     error = float(np.std(gain)) / max(1, len(gain) - 1) ** 0.5
@@ -140,10 +140,10 @@ def paired_gain(returns: Sequence[float], reference: Sequence[float]) -> dict[st
 
 
 def references(venv: VecEnv, num_episodes: int) -> dict[str, dict[str, Any]]:
-    """What random walk, standing still and the greedy planner reach on the same episodes.
+    """Scores of random walk, standing still and the greedy planner on the same episodes.
 
-    Where an action has a second number, the SLAM configuration, random walk draws that too and the
-    other two keep to the last, the most robust.
+    Where an action also sets the SLAM configuration, random walk draws that too, and the other two
+    keep the last, most robust one.
     """
     targets = venv.get_attr("config")[0].targets
     parts = action_parts(venv.action_space)

@@ -1,4 +1,4 @@
-"""A policy for what is near by, and goals for the way to what is not."""
+"""An agent that uses a policy for nearby space, and goals for distant space."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ if TYPE_CHECKING:
 
 
 _REMAINS = 0.3
-"""Share of what the camera sees that should remain in its image, or as much as there can."""
+"""Share of the current view that should remain in the image, or as much as possible."""
 _OBSERVATIONS = ("goals", "held")
 
 
 class HomePolicy(ShippedAgent):
-    """The policy of `agent-home`, which begins as that of `agent-room` and was taught in homes."""
+    """The policy of `agent-home`: that of `agent-room`, further trained in homes."""
 
     default_path = SHIPPED / "home.safetensors"
 
 
 class HomeAgent(NextBestView):
-    """A policy while there is something to see near by; goals as `nbv` has them.
+    """Follows a policy while there is something to see nearby; otherwise goes to goals as `nbv`.
 
-    A policy that sees some metres around does not find its way to the next room. As in Active
-    Neural SLAM (Chaplot et al., ICLR 2020) goals are what is above it: where the best view near by
-    would show too little, or where the policy comes back to where it has been, this planner goes to
-    a goal and there gives the camera back. The policy chooses among the motions that are not likely
-    to slip by what it is shown of them itself, and not among those that lost tracking before (a
-    shield, Alshiekh et al., AAAI 2018): the view from here is all that is asked of the map.
+    A policy that sees a few metres around does not find its way to the next room. As in Active
+    Neural SLAM (Chaplot et al., ICLR 2020), goals form a level above it: where the best nearby view
+    would show too little, or where the policy returns to a visited pose, this planner goes to a
+    goal and then hands control back. The policy chooses among the motions that, by its own
+    observation, are unlikely to slip, without those that lost tracking before (a shield, Alshiekh
+    et al., AAAI 2018): only the current view is predicted from the map.
 
     Args:
-        robot: what it sees.
-        seed: of the goals drawn.
-        path: file of the policy; default: the one that comes with the package.
-        **options: see `NextBestView`; ``enough_m3`` is what the best view near by should show.
+        robot: the robot's view.
+        seed: for drawing goals.
+        path: policy file; default: the one shipped with the package.
+        **options: see `NextBestView`; ``enough_m3`` is what the best nearby view should show.
 
     Raises:
         InputError: an option out of its range, or a policy that does not fit the environment or
-            is not shown the risks.
+            whose observation lacks the risks.
     """
 
     def __init__(
@@ -59,27 +59,27 @@ class HomeAgent(NextBestView):
 
     @staticmethod
     def check_policy(observation: str) -> None:
-        """Refuse a policy that sees an observation without the risks.
+        """Refuse a policy whose observation lacks the risks.
 
         Raises:
-            InputError: naming the ones that have them.
+            InputError: naming the observations that have them.
         """
         if observation not in _OBSERVATIONS:
             raise unknown("observation of the policy under agent-home", observation, _OBSERVATIONS)
 
     @classmethod
     def observation_for(cls, path: str | None = None, **options: Any) -> str:
-        """What the policy was trained on."""
+        """The observation variant that the policy was trained on."""
         return HomePolicy.observation_for(path)
 
     def reset(self) -> None:
-        """Nothing is known yet."""
+        """Forget the last episode."""
         super().reset()
         self.near.reset()
         self._choices: NDArray[np.bool_] | None = None
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
-        """Carve the last frame, choose a motion."""
+        """Carve the last frame and choose a motion."""
         self.seen = np.asarray(observation)
         return super().act(observation, info)
 
@@ -102,11 +102,11 @@ class HomeAgent(NextBestView):
         return self.go_to_goal(here) if self._choices is None else int(wanted)
 
     def choices(self) -> NDArray[np.bool_] | None:
-        """The motions that are not likely to slip; None on the way to a goal."""
+        """The motions unlikely to slip; None on the way to a goal."""
         return self._choices
 
     def safe_motions(self, here: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which motions (n,) are not likely to slip, as far as the policy's observation says."""
+        """Which motions (n,) are unlikely to slip, according to the policy's observation."""
         poses = self.robot.candidate_poses()
         rows = self.seen[self.near.policy.metadata.num_state :].reshape(len(poses), -1)
         of = dict(zip(GRID_NAMES, rows.T.astype(np.float64), strict=False))

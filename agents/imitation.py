@@ -2,10 +2,10 @@
 
     ms-slam train imitation --teacher nbv --observation map --out runs/imitation
 
-In the first round the teacher acts. In later ones the policy does, more and more, and the teacher
-says what it would have done where the policy has come to; the network is fitted to all rounds so
-far: to the teacher's actions, and its value to the returns met. Writes into ``out`` what
-``ms-slam train`` writes, and ``episodes/``; ``ms-slam train --init`` goes on from it with PPO.
+In the first round the teacher acts. In later rounds the policy acts increasingly, and the teacher
+labels the visited states with its own actions. The network is fitted to all rounds so far: its
+policy to the teacher's actions, its value to the observed returns. Writes the files of ``ms-slam
+train`` and ``episodes/`` into ``out``; continue from it with PPO by ``ms-slam train --init``.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _OWN_PROBLEM = {*KEPT, "teacher", "episodes", "epochs", "seed", "memory"}
 
 
 def tasks(args: Args, number: int) -> list[Task]:
-    """The episodes of a round, each with a seed of its own."""
+    """The episodes of a round, each with a different seed."""
     options = problem_options(args, "train")
     first = _TRAINING_SEED + args.seed * 100_000 + number * args.episodes
     return [
@@ -70,11 +70,11 @@ def tasks(args: Args, number: int) -> list[Task]:
 
 
 def play_round(args: Args, number: int) -> None:
-    """Play those episodes of a round that are not there yet.
+    """Play the missing episodes of a round.
 
     Raises:
         InputError: options that the environment or the teacher refuses.
-        RuntimeError: an episode that failed.
+        RuntimeError: an episode failed.
     """
     missing = {task.path: task for task in tasks(args, number) if not task.path.exists()}
     if not missing:
@@ -94,10 +94,10 @@ def play_round(args: Args, number: int) -> None:
 
 
 def load_run(args: Args) -> tuple[PolicyFile | None, int]:
-    """What there is to resume, and the rounds done; None and 0 for a new run.
+    """Load the run to resume from, and its number of rounds; None and 0 for a new run.
 
     Raises:
-        InputError: a new run where there is one already, nothing to resume from, or another one.
+        InputError: a new run in a folder that has one, nothing to resume from, or another run.
     """
     if not args.resume:
         check_new(args.out, LATEST, "episodes")

@@ -1,4 +1,4 @@
-"""The learning curve of a training run, as a result like all others."""
+"""The learning curve of a training run, written as a result."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _TRAINED = ("timesteps", "training_min", "return", "return_gain", "return_gain_s
 
 @dataclass
 class Curve:
-    """Scores of a policy while it is trained, and of reference planners on the same episodes.
+    """Scores of a policy during training, and of reference planners on the same episodes.
 
     Attributes:
-        episodes: of each evaluation.
+        episodes: number of episodes of each evaluation.
         references: planner to scores, as ``evaluate`` returns them.
         points: scores with ``timesteps`` and ``training_min``, the oldest first.
         config: the training script's options.
@@ -45,7 +45,7 @@ class Curve:
 
     @property
     def best(self) -> float:
-        """Highest return of a point after training began; -inf without any."""
+        """Highest return of a point after the start of training; -inf without any."""
         found = [point["return"] for point in self.points if point["timesteps"]]
         return max(found, default=-float("inf"))
 
@@ -55,16 +55,16 @@ class Curve:
         return self.points[-1]["timesteps"] if self.points else -1
 
     def is_due(self, steps: int, every: int) -> bool:
-        """Whether the policy after ``steps`` has a point to come: the first, and one in ``every``.
+        """Whether the policy after ``steps`` needs a point: the first, and one per ``every`` steps.
 
-        A run that ended between saving and evaluating makes up for its point when it goes on.
+        A run that stopped between saving and evaluating adds its missing point when resumed.
         """
         return not self.points or bool(every and steps // every > self.steps // every)
 
     def add(self, timesteps: int, minutes: float, scores: Mapping[str, Any]) -> dict[str, Any]:
-        """Add a point; with random walk among the references, with its gain over that.
+        """Add a point, with its gain over random walk if that is among the references.
 
-        It takes the place of one of the same steps, of a round that is done again.
+        It replaces a point with the same steps, from a round that is repeated.
         """
         point = {"timesteps": timesteps, "training_min": round(minutes, 3), **scores}
         if BASELINE in self.references:
@@ -75,7 +75,7 @@ class Curve:
     def judge(
         self, file: PolicyFile, validation: VecEnv, out: Path, deterministic: bool = False
     ) -> dict[str, Any]:
-        """Evaluate a policy, add a point, write the curve, and the policy if none was better."""
+        """Evaluate a policy, add a point, write the curve, and the policy if it is the best."""
         known = file.metadata
         scores = evaluate_policy(validation, self.episodes, Policy(file), deterministic)
         if known.epochs and scores["return"] > self.best:
@@ -85,7 +85,7 @@ class Curve:
         return point
 
     def in_words(self, point: Mapping[str, Any]) -> str:
-        """A point in one line."""
+        """Describe a point in one line."""
         gain = ""
         if "return_gain" in point:
             gain = (
@@ -150,10 +150,10 @@ class Curve:
 
 
 def read_curve(path: Path) -> Curve:
-    """The curve in a ``results.json`` of a training run.
+    """Read the curve from the ``results.json`` of a training run.
 
     Raises:
-        InputError: another result.
+        InputError: the file is not the result of a training run.
     """
     results = read_results(path)
     curve = Curve(0)
@@ -171,7 +171,7 @@ def read_curve(path: Path) -> Curve:
 
 
 def _checked(scores: dict[str, Any], *more: str) -> dict[str, Any]:
-    """Scores with a number for everything that tables and charts show."""
+    """Check that scores have every number that tables and charts show."""
     for key in (*_SCORES, *more):
         float(scores[key])
     return scores

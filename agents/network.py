@@ -1,4 +1,4 @@
-"""The network of our own trainers: a policy and a value, or the quantiles of the returns."""
+"""The network of our trainers: a policy and a value, or the quantiles of the returns."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ BLOCKED = -1e9  # logit of a blocked action; -inf would make NaN of its entropy
 
 
 class Network(nn.Module):
-    """Two hidden layers for the policy and two for the value, behind a memory if there is one.
+    """Two hidden layers for the policy and two for the value, after an optional memory.
 
-    With ``candidates`` numbers of each action at the end of an observation, one encoder looks at
-    each action's, the layers see the state and the mean and the largest of what it makes of them,
-    and one score is given for each: in another order the actions have the same probabilities.
-    With ``quantiles`` there is no value: each action has so many quantiles of the return.
-    With an ``image`` (channels, rows, columns) at the end of an observation, convolutions look at
-    it, and the layers see the state and what these make of it.
-    While it trains, a share ``dropout`` of what the layers see is zero, drawn anew each time.
+    With ``candidates`` values per action at the end of an observation, a shared encoder processes
+    each action's values, the layers get the state and the mean and maximum of the encodings, and
+    each action gets a score, so that the order of the actions does not matter.
+    With ``quantiles`` there is no value: each action has this number of quantiles of the return.
+    With an ``image`` (channels, rows, columns) at the end of an observation, the layers get the
+    state and the output of convolutions on the image.
+    In training, a random share ``dropout`` of the layers' input is set to zero.
 
     The names of the parameters are Stable-Baselines3's, ``memory.*``, ``encoder.*``, ``score.*``,
     ``image.*``.
@@ -95,7 +95,7 @@ class Network(nn.Module):
             seen: observations (L, B, k).
             memory: (B, M) before the first step.
             begins: (L, B) where an episode begins.
-            masks: (L, B, n) of the actions that are possible.
+            masks: (L, B, n) the possible actions.
         """
         rows = []
         for now, first, possible in zip(seen, begins, masks, strict=True):
@@ -110,7 +110,7 @@ class Network(nn.Module):
         return scores.reshape(len(seen), self.actions, -1)
 
     def _look(self, seen: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What the layers see (B, k), and the candidates (B, n, E) as encoded, if there are any."""
+        """Input of the layers (B, k), and the encoded candidates (B, n, E), if any."""
         if self.image is not None:
             made = self.image(seen[:, self.num_state :].unflatten(1, self.shape)).flatten(1)
             return self.dropout(torch.cat([seen[:, : self.num_state], made], dim=1)), None
@@ -121,7 +121,7 @@ class Network(nn.Module):
         return self.dropout(torch.cat(parts, dim=1)), encoded
 
     def _score(self, x: Tensor, encoded: Tensor | None) -> Tensor:
-        """What the last layer says, of all actions (B, n Q) or of each candidate (B, n, Q)."""
+        """Output of the last layer, for all actions (B, n Q) or each candidate (B, n, Q)."""
         whole = self.mlp_extractor["policy_net"](x)
         if self.score is not None and encoded is not None:
             beside = whole[:, None].expand(-1, self.actions, -1)
@@ -129,17 +129,17 @@ class Network(nn.Module):
         return self.action_net(whole)
 
     def tensors(self) -> Tensors:
-        """The parameters, as a policy file has them."""
+        """The parameters in the form of a policy file."""
         return {f"policy.{n}": p.detach().numpy().copy() for n, p in self.named_parameters()}
 
 
 def load_parameters(network: nn.Module, file: PolicyFile, part: str = "policy") -> None:
-    """Put the parameters where they stood when the file was written."""
+    """Load the parameters from a policy file."""
     network.load_state_dict({name: torch.from_numpy(v) for name, v in file.part(part).items()})
 
 
 def _convolutions(channels: int) -> nn.Sequential:
-    """Those of ``CONVOLUTIONS``, rectified."""
+    """The layers of ``CONVOLUTIONS``, each followed by a rectifier."""
     made: list[nn.Module] = []
     for more, edge, stride in CONVOLUTIONS:
         made += [nn.Conv2d(channels, more, edge, stride), nn.ReLU()]

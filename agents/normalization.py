@@ -1,4 +1,4 @@
-"""Running moments of observations and returns, by which networks see both."""
+"""Running moments that normalise observations and returns for the networks."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 
 class PooledMoments(RunningMeanStd):
-    """Running moments that are the same for all candidates, whose order means nothing.
+    """Running moments shared by all candidates, whose order has no meaning.
 
     Args:
-        inputs: numbers of an observation.
-        actions: candidates at its end.
-        candidates: numbers of each.
+        inputs: length of an observation.
+        actions: number of candidates at its end.
+        candidates: values per candidate.
     """
 
     def __init__(self, inputs: int, actions: int, candidates: int) -> None:
@@ -27,7 +27,7 @@ class PooledMoments(RunningMeanStd):
         self._rows = actions, candidates
 
     def update(self, arr: NDArray[Any]) -> None:
-        """Learn from observations (B, inputs)."""
+        """Update the moments with observations (B, inputs)."""
         self.update_from_moments(*self.pooled(arr), len(arr))
 
     def pooled(self, observations: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -40,12 +40,12 @@ class PooledMoments(RunningMeanStd):
 
 
 class Normalization:
-    """What VecNormalize knows, for who keeps observations and rewards as they came.
+    """The moments of VecNormalize, for trainers that store raw observations and rewards.
 
     Args:
-        inputs: numbers of an observation.
-        actions: that there are.
-        candidates: numbers of each action at the end of an observation, all on one scale.
+        inputs: length of an observation.
+        actions: number of actions.
+        candidates: values per action at the end of an observation, normalised alike for all.
         gamma: discount factor of the returns.
     """
 
@@ -57,14 +57,14 @@ class Normalization:
         self.gamma = gamma
 
     def scaled(self, observations: NDArray[Any]) -> NDArray[np.float32]:
-        """As a network sees observations (B, inputs)."""
+        """Normalise observations (B, inputs)."""
         scaled = (observations - self.obs_rms.mean) / np.sqrt(self.obs_rms.var + EPSILON)
         return np.clip(scaled, -CLIP, CLIP).astype(np.float32)
 
     def see_rewards(
         self, sums: NDArray[Any], rewards: NDArray[Any], ends: NDArray[np.bool_]
     ) -> NDArray[Any]:
-        """Learn from the rewards (B,) of a step.
+        """Update the moments with the rewards (B,) of a step.
 
         Args:
             sums: (B,) discounted, of the rewards before, the latest weighing most.
@@ -72,7 +72,7 @@ class Normalization:
             ends: (B,) whether an episode ends with them.
 
         Returns:
-            The sums to go on with.
+            The updated sums.
         """
         sums = sums * self.gamma + rewards
         self.ret_rms.update(sums)
@@ -80,7 +80,7 @@ class Normalization:
 
     @property
     def return_scale(self) -> float:
-        """What rewards are divided by."""
+        """The divisor of rewards."""
         return float(np.sqrt(self.ret_rms.var + EPSILON))
 
 
@@ -93,7 +93,7 @@ def moment_tensors(normalize: VecNormalize | Normalization) -> Tensors:
 
 
 def restore_moments(normalize: VecNormalize | Normalization, file: PolicyFile) -> None:
-    """Put the running moments where they stood when the file was written."""
+    """Load the running moments from a policy file."""
     _restore_moments(normalize.obs_rms, file.part("observation"))
     _restore_moments(normalize.ret_rms, file.part("return"))
 

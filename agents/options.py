@@ -1,4 +1,4 @@
-"""Options that the training scripts have in common, and the tasks that set them."""
+"""Options common to the training scripts, and the tasks that set them."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from ms_slam_env.slam.configuration import is_file_name
 
 @dataclass(frozen=True)
 class Problem(Checked):
-    """Where a policy is trained and judged.
+    """Where a policy is trained and evaluated.
 
     Attributes:
         out: folder for everything the run writes.
-        resume: go on with the run in ``out``; options that are not given are those of the run so
-            far. Files, modules and addresses among them must be given again.
-        task: whose options to begin with: a name, of a file in ``hyperparameters/``, or a YAML file
-            of your own; what is given beside it counts more.
+        resume: resume the run in ``out``; options not given keep their values from the run. Files,
+            modules and addresses must be given again.
+        task: preset of options: a name of a file in ``hyperparameters/``, or your own YAML file;
+            options given explicitly override it.
         env_id: id of the environment.
-        embodiment: what carries the camera; None: what the id says.
-        observation: a variant by name, of one vector; `held` shows what the motions would show if
-            they were held for some steps, and taught most of those that were compared; `features`
-            takes the least time.
-        scenes: trained and validated on, with training and validation seeds.
-        scene_seeds: seeds of each scene, from the split's first; as many as the agents that are
-            shipped had. Few are learnt by heart.
+        embodiment: carrier of the camera; None: that of the id.
+        observation: name of a variant that is one vector; `held` shows what the motions would
+            reveal if repeated for some steps, and gave the best imitation results; `features` is
+            the fastest.
+        scenes: scenes to train and validate on, with training and validation seeds.
+        scene_seeds: number of seeds per scene, from the split's first; the default is that of the
+            shipped agents. A policy memorizes few.
         episode_steps: time limit of an episode.
         step_m: translation of a motion; None: the environment's default.
         step_deg: rotation of a motion; None: the environment's default.
-        frames_per_action: frames of a motion; None: of an arm as many as arrive while it moves,
-            some ten, of a free camera those of the environment. With ``--embodiment arm-kinematic
-            --frames-per-action 1`` a step costs little more than the free camera's: a world to
-            train in before the arm itself (``--init``).
+        frames_per_action: frames per motion; None: for an arm as many as arrive while it moves,
+            some ten, for a free camera the environment's default. With ``--embodiment arm-kinematic
+            --frames-per-action 1`` a step costs little more than the free camera's, which suits
+            pretraining for the arm itself (``--init``).
         reward: preset of the environment's reward, `default` or `paper`.
-        without: terms of the reward that count nothing.
+        without: reward terms to ignore.
         image_size: of the camera in training and validation, width x height; None: the
-            environment's own. At 80x60 a step costs half as much, and SLAM holds on less: a world
-            to begin in. Which one it was is no part of the policy.
+            environment's default. At 80x60 a step costs half as much, and SLAM loses track more
+            easily: use it to begin with. The policy file does not depend on it.
         num_envs: parallel environments, one process and one thread each.
         seed: of network, training episodes and sampling.
         eval_episodes: validation episodes, the same at each evaluation, with the same random
@@ -74,10 +74,10 @@ class Problem(Checked):
     deterministic_eval: bool = False
 
     algorithms: ClassVar[tuple[str, ...]] = ()
-    """What a policy file of such a training may say that it is of."""
+    """Values of ``algorithm`` in the policy files of such a training."""
 
     def __post_init__(self) -> None:
-        """Refuse values out of range, and training nowhere."""
+        """Refuse values out of range, and a training without scenes."""
         super().__post_init__()
         if not self.scenes:
             raise InputError(f"{type(self).__name__}.scenes names no scene")
@@ -94,46 +94,46 @@ class Problem(Checked):
 
     @property
     def candidates(self) -> int:
-        """Numbers of each action that our own networks look at one by one; 0 without any."""
+        """Values per action that our networks encode action by action; 0 without any."""
         return int(getattr(OBSERVATIONS.find(self.observation), "candidate_numbers", 0))
 
     @property
     def image(self) -> tuple[int, ...]:
-        """Channels, rows and columns of an image that convolutions look at; empty without one."""
+        """Channels, rows and columns of an image for convolutions; empty without one."""
         return tuple(getattr(OBSERVATIONS.find(self.observation), "image_shape", ()))
 
     @property
     def layers(self) -> dict[str, Any]:
-        """What the file of a policy to begin with has to say of its layers, beside their width."""
+        """Settings of the layers, besides their width, that an initial policy must share."""
         return {"memory": 0, "candidates": self.candidates, "image": self.image, "quantiles": 0}
 
 
 @dataclass(frozen=True)
 class Training(Problem):
-    """How long a policy learns from the steps that it makes, and what from.
+    """How long a policy learns from its own steps, and from where it starts.
 
     Attributes:
-        init: policy file to begin with, as of ``ms-slam train imitation``; its network and
-            normalisation, not its steps.
-        through: planner that the policy acts through, in validation too: `agent-home` has goals for
-            the way to what is not near by, and lets the policy choose among motions that are not
-            likely to slip. None: the policy acts by itself.
-        total_timesteps: environment steps, all runs of a resumed training together.
-        minutes: stop this run after training for so much wall-clock time; evaluations and the
-            episodes of the references come on top. None: by steps alone.
+        init: policy file to start from, such as one of ``ms-slam train imitation``; its network and
+            normalisation are used, its step count is not.
+        through: planner through which the policy acts, also in validation: `agent-home` goes to
+            distant goals itself, and lets the policy choose among motions unlikely to slip. None:
+            the policy acts by itself.
+        total_timesteps: environment steps of a training, including the runs before it was resumed.
+        minutes: stop this run after so many minutes of training; evaluations and reference episodes
+            are not counted. None: no such limit.
         eval_every: environment steps between evaluations; 0: only first and last.
-        references: play the validation episodes with random walk, standing still and the greedy
-            planner too, before training.
+        references: before training, also play the validation episodes with random walk, standing
+            still and the greedy planner.
         learning_rate: of Adam.
         gamma: discount factor.
         hidden: width of the two hidden layers.
         curriculum: YAML file of stages, from easy to the problem itself: see ``curriculum.py``.
-        episodes_per_scene: episodes in a row in a scene that was drawn. To build a room takes a
-            second, a home longer, where it is not one of the last 20 rooms or five homes. Episodes
-            of a stage that draws noise or perturbations draw a scene each.
-        also: further tasks to train in, named as ``task`` is: the parallel environments are of the
-            problem itself and of these in turn. Of them count where they are, how long and with
-            which motions. Validation knows the problem alone.
+        episodes_per_scene: consecutive episodes in a drawn scene. Building a room takes a second, a
+            home longer, unless it is one of the last 20 rooms or five homes. In a stage that draws
+            noise or perturbations, each episode draws a scene.
+        also: further tasks to train in, named like ``task``; the parallel environments alternate
+            between the problem itself and these. Only their scenes, episode lengths and motions are
+            used. Validation uses the problem alone.
     """
 
     init: Path | None = None
@@ -155,16 +155,16 @@ class Training(Problem):
 
 @dataclass(frozen=True)
 class PpoTraining(Training):
-    """How proximal policy optimisation learns.
+    """Options of proximal policy optimisation.
 
     Attributes:
-        n_steps: steps of each environment between updates; of ``ms-slam train sb3`` fewer where
-            ``total_timesteps`` leaves fewer.
-        batch_size: of the gradient steps, in steps.
-        n_epochs: passes over the data of one update.
+        n_steps: steps of each environment between updates; fewer in ``ms-slam train sb3`` if fewer
+            remain of ``total_timesteps``.
+        batch_size: environment steps per gradient step.
+        n_epochs: passes over the data in one update.
         gae_lambda: trade-off between bias and variance of the advantages.
         ent_coef: weight of the entropy bonus.
-        clip_range: of PPO's objective.
+        clip_range: clipping range of PPO's objective.
     """
 
     n_steps: int = bounded(512, 2, 1_000_000)  # advantages of one sample have no spread
@@ -180,7 +180,7 @@ P = TypeVar("P", bound=Problem)
 
 
 def named_in(arguments: Sequence[str]) -> dict[str, str]:
-    """The options that a command line names, each with the word after it."""
+    """The options given on a command line, each with the word after it."""
     words = [part for word in arguments for part in word.split("=", int(word.startswith("--")))]
     pairs = pairwise([*words, ""])
     return {one[2:].replace("-", "_"): after for one, after in pairs if one.startswith("--")}
@@ -192,10 +192,10 @@ def shipped_tasks() -> list[str]:
 
 
 def of_task(cls: type[P], task: str, trainer: str) -> P:
-    """Options ``cls`` of a task: those of ``problem``, and those of the trainer.
+    """Read the options ``cls`` of a task: its sections ``problem`` and that of the trainer.
 
     Raises:
-        InputError: an unknown task, or a file that does not hold such options.
+        InputError: an unknown task, or a file without such options.
     """
     path = Path(task) if is_file_name(task) else TASKS / f"{task}.yaml"
     if not is_file_name(task) and task not in shipped_tasks():
@@ -226,14 +226,14 @@ WORLD = (
     "step_deg",
     "frames_per_action",
 )
-"""Options that a further task to train in has of its own."""
+"""Options that a task of ``also`` sets for its environments."""
 
 
 def world_of(args: P, environment: int) -> P:
-    """The problem that a training's parallel environment plays, by its number from 0.
+    """The problem of a training's parallel environment, numbered from 0.
 
     Raises:
-        InputError: an unknown task, or a file that does not hold such options.
+        InputError: an unknown task, or a file without such options.
     """
     also: tuple[str, ...] = getattr(args, "also", ())
     place = environment % (1 + len(also))
@@ -244,11 +244,11 @@ def world_of(args: P, environment: int) -> P:
 
 
 SECTIONS = ("problem", "sb3", "imitation", "ppo", "qrdqn", "rllib")
-"""Of a file of hyperparameters: the problem, and the options of each trainer."""
+"""Sections of a hyperparameter file: the problem, and the options of each trainer."""
 
 
 def of_types(made: P, what: str) -> P:
-    """The same options, all of the types that they are declared with."""
+    """Check that all options have their declared types, and return them."""
     for name, hint in get_type_hints(type(made)).items():
         if not _is_of(getattr(made, name), hint):
             raise InputError(f"{what} {name} = {getattr(made, name)!r} is of the wrong type")

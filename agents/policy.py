@@ -1,4 +1,4 @@
-"""A trained policy in NumPy alone: running it needs neither PyTorch nor Stable-Baselines3."""
+"""Run a trained policy with NumPy alone, without PyTorch or Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ class Policy:
         file: as ``read_policy`` returns it.
 
     Attributes:
-        metadata: what the file says: environment, observation, how long it was trained.
-        parts: choices of each number that an action consists of; one number in most environments.
-        num_actions: all of them together, the length of a mask.
+        metadata: from the file: environment, observation, length of training.
+        parts: number of choices for each part of an action; one part in most environments.
+        num_actions: sum of these, the length of a mask.
     """
 
     def __init__(self, file: PolicyFile) -> None:
@@ -74,16 +74,16 @@ class Policy:
         """Read a policy file; nothing in it is executed.
 
         Raises:
-            InputError: there is no such file, or it is not a policy file of this package.
+            InputError: no such file, or not a policy file of this package.
         """
         return cls(read_policy(path))
 
     def reset(self) -> None:
-        """Begin an episode: what ``act`` remembers is forgotten."""
+        """Begin an episode: clear the memory of ``act``."""
         self._memory = self.empty_memory(1)
 
     def empty_memory(self, rows: int) -> Float64:
-        """The memory (B, M) of ``rows`` episodes that begin; M is 0 for a policy without one."""
+        """Initial memory (B, M) of ``rows`` episodes; M is 0 for a policy without memory."""
         return np.zeros((rows, self.metadata.memory))
 
     def remember(self, observations: NDArray[Any], memory: Float64) -> Float64:
@@ -102,14 +102,15 @@ class Policy:
         return (1 - keep) * np.tanh(n_x + reset * n_h) + keep * memory
 
     def _scaled(self, observations: NDArray[Any]) -> Float64:
-        """As the network saw them in training."""
+        """Normalise observations as in training."""
         scaled = np.clip((observations - self._mean) / self._std, -CLIP, CLIP)
         return scaled.astype(np.float32).astype(np.float64)
 
     def _look(self, scaled: Float64) -> tuple[Float64, Float64]:
-        """What the layers see (B, k), and the candidates (B, n, E) as encoded, if there are any.
+        """Input of the layers (B, k), and the encoded candidates (B, n, E), if any.
 
-        The state, and the mean and the largest of the encoded candidates: none comes first.
+        The input is the state, and the mean and maximum of the encoded candidates, which do not
+        depend on their order.
         """
         start = self.metadata.num_state
         if self._image:
@@ -134,16 +135,16 @@ class Policy:
     ) -> Float64:
         """Probabilities (B, n) of the actions, 0 where ``masks`` (B, n) is false.
 
-        Of an action of several numbers, those of each number side by side; each sums to 1. Of a
-        network of quantiles, 1 for the action whose return is expected to be the largest.
+        For an action of several parts, the probabilities of the parts are concatenated; each part
+        sums to 1. For a quantile network, 1 for the action with the largest expected return.
 
         Args:
             observations: (B, k) as the environment returns them, not normalised.
-            masks: (B, n) true for permitted actions, at least one a row and number.
+            masks: (B, n) true for permitted actions, at least one per row and part.
             memory: (B, M) after these observations, as ``remember`` returns it; None: empty.
 
         Raises:
-            InputError: observations of another environment or variant, or such masks.
+            InputError: observations or masks of another environment or variant.
         """
         self._check(observations, masks)
         *hidden, (weight, bias) = self._layers
@@ -177,14 +178,14 @@ class Policy:
         mask: NDArray[np.bool_],
         rng: np.random.Generator | None = None,
     ) -> Any:
-        """One action, with what was seen since ``reset`` in mind.
+        """Choose one action, using the memory since ``reset``.
 
-        An integer, or an array of them where an action has several numbers.
+        Returns an integer, or an array of integers where an action has several parts.
 
         Args:
             observation: (k,) as the environment returns it.
             mask: (n,) ``info["action_mask"]``.
-            rng: to draw from the probabilities; None: take the most probable action.
+            rng: generator to sample from the probabilities; None: take the most probable action.
 
         Raises:
             InputError: an observation or a mask of another shape.
@@ -200,19 +201,18 @@ class Policy:
         return action if np.ndim(action) else int(action)
 
     def see(self, observation: NDArray[Any]) -> None:
-        """Keep in mind an observation (k,) in whose step another chooses."""
+        """Update the memory with an observation (k,) for which another planner acts."""
         self._memory = self.remember(np.asarray(observation)[None], self._memory)
 
     def make_env(self, **options: Any) -> gym.Env[Any, Any]:
-        """The environment that fits: ``gym.make`` with the id, observation and steps of training.
+        """Make a matching environment: ``gym.make`` with the id, observation and steps of training.
 
         Args:
-            options: of ``gym.make``, as ``scene`` or ``max_episode_steps``; they come before those
-                of training.
+            options: of ``gym.make``, such as ``scene`` or ``max_episode_steps``; they override
+                those of training.
 
         Raises:
-            InputError: an environment that is not installed, or options that it or the policy
-                refuses.
+            InputError: the environment is not installed, or it or the policy refuses an option.
         """
         known = self.metadata.env_options | {"observation": self.metadata.observation}
         try:
@@ -223,7 +223,7 @@ class Policy:
         return env
 
     def check_fits(self, env: Any) -> None:
-        """Refuse an environment with other observations or actions than the policy has.
+        """Refuse an environment whose observations or actions differ from the policy's.
 
         Raises:
             InputError: naming both sides.
@@ -243,7 +243,7 @@ class Policy:
 
 
 def _convolved(images: Float64, weight: Float64, stride: int) -> Float64:
-    """Images (B, C, H, W) seen through filters (O, C, K, K), as PyTorch's ``conv2d``."""
+    """Convolve images (B, C, H, W) with filters (O, C, K, K), as PyTorch's ``conv2d``."""
     windows = np.lib.stride_tricks.sliding_window_view(images, weight.shape[2:], axis=(2, 3))
     near = windows[:, :, ::stride, ::stride]  # (B, C, rows, columns, K, K)
     return np.moveaxis(np.tensordot(near, weight, axes=((1, 4, 5), (1, 2, 3))), 3, 1)
@@ -255,7 +255,7 @@ def _layer(network: dict[str, Float64], name: str) -> tuple[Float64, Float64]:
 
 
 def action_parts(space: Any) -> tuple[int, ...]:
-    """Choices of each number that an action of a discrete space consists of."""
+    """Number of choices for each part of an action of a discrete space."""
     if isinstance(space, spaces.MultiDiscrete):
         return tuple(int(n) for n in space.nvec)
     return (int(space.n),)
@@ -264,10 +264,10 @@ def action_parts(space: Any) -> tuple[int, ...]:
 def sample(
     probabilities: Float64, rngs: Sequence[np.random.Generator], parts: Sequence[int] = ()
 ) -> Actions:
-    """Draw one action a row of ``probabilities`` (B, n), each from its own generator.
+    """Draw one action per row of ``probabilities`` (B, n), each from its own generator.
 
-    With several ``parts``, choices of each number of an action, (B, numbers). A draw takes one
-    number of the generator whatever the probabilities are.
+    With several ``parts``, actions are (B, parts). A draw takes one number from the generator,
+    whatever the probabilities.
     """
     drawn = [
         [rng.choice(len(row), p=row) for rng, row in zip(rngs, part, strict=True)]
@@ -277,17 +277,17 @@ def sample(
 
 
 def most_probable(probabilities: Float64, parts: Sequence[int] = ()) -> Actions:
-    """The most probable action of each row of ``probabilities`` (B, n), as ``sample`` has them."""
+    """The most probable action of each row of ``probabilities`` (B, n), shaped as in ``sample``."""
     return joined([np.argmax(part, axis=1) for part in split(probabilities, parts)])
 
 
 def split(values: NDArray[Any], parts: Sequence[int]) -> list[NDArray[Any]]:
-    """The columns of each number of an action."""
+    """Split columns by the parts of an action."""
     return np.split(values, np.cumsum(parts)[:-1], axis=1) if len(parts) > 1 else [values]
 
 
 def joined(numbers: Sequence[Any]) -> Actions:
-    """Actions from the choices (B,) of each of their numbers."""
+    """Join the choices (B,) of each part into actions."""
     return np.stack(numbers, axis=1) if len(numbers) > 1 else np.array(numbers[0])
 
 

@@ -1,10 +1,10 @@
-"""A trained policy as one safetensors file: numbers and a JSON text, nothing that could run.
+"""A trained policy as one safetensors file: numbers and a JSON text, nothing executable.
 
 Tensors: ``policy.*``, the network under Stable-Baselines3's names; ``observation.*`` and
 ``return.*``, the running moments that normalised training; in a file to resume from also
-``optimizer.*``, the moments of Adam, and ``target.*``, the network that says what quantiles are
-fitted to. The text is :class:`Metadata`. Whatever is loaded is checked
-first, since policies come from strangers.
+``optimizer.*``, the moments of Adam, and ``target.*``, the network that gives the targets of
+quantiles. The text is :class:`Metadata`. Everything is checked before it is loaded, since policies
+may come from untrusted sources.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ _LARGEST_NUMBER = 1e12  # of moments and counts
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a policy file says about its numbers.
+    """Description of the numbers in a policy file.
 
     Attributes:
         algorithm: one of ``ALGORITHMS``.
         env_id: id of the environment it was trained in.
-        env_options: of that environment, where not its defaults: those of ``embodiment``,
-            ``step_m`` and ``step_rad``.
+        env_options: options of that environment that differ from its defaults, among
+            ``embodiment``, ``step_m`` and ``step_rad``.
         observation: observation variant that the policy expects.
         inputs: numbers of an observation.
         hidden: widths of the hidden layers, tanh between them.
@@ -95,13 +95,13 @@ class Metadata:
     version: int = VERSION
 
     def __post_init__(self) -> None:
-        """Hold sequences as tuples, however they came."""
+        """Convert sequences to tuples."""
         for name in ("hidden", "actions", "image"):
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
 
     def check(self) -> None:
-        """Refuse values that no policy has.
+        """Refuse values that no policy can have.
 
         Raises:
             InputError: naming the value.
@@ -146,10 +146,10 @@ class Metadata:
                 raise InputError(f"{name} = {getattr(self, name)} is outside [0, {most:g}]")
 
     def check_sizes(self, path: Path, inputs: int, *actions: int) -> None:
-        """Refuse another number of inputs or of actions than a training has.
+        """Refuse numbers of inputs or actions that differ from a training's.
 
         Raises:
-            InputError: naming the ``path`` of the file, what it has and what the training has.
+            InputError: naming the ``path`` of the file, its numbers and those of the training.
         """
         if (self.inputs, tuple(self.actions)) != (inputs, actions):
             raise InputError(
@@ -165,12 +165,12 @@ class Metadata:
 
     @property
     def encoded(self) -> int:
-        """Width of what the encoder makes of a candidate."""
+        """Width of a candidate's encoding."""
         return encoded_width(self.hidden[0])
 
 
 def encoded_width(hidden: int) -> int:
-    """Width of what the encoder makes of a candidate, beside a hidden layer of some width."""
+    """Width of a candidate's encoding, given the width of a hidden layer."""
     return max(8, hidden // 4)
 
 
@@ -179,7 +179,7 @@ CONVOLUTIONS = ((16, 5, 2), (32, 3, 2), (32, 3, 2))
 
 
 def image_width(image: Sequence[int]) -> int:
-    """Numbers that the last convolution makes of an image (channels, rows, columns); 0: none."""
+    """Length of the last convolution's output for an image (channels, rows, columns), or 0."""
     rows, columns = image[1:]
     for _, edge, stride in CONVOLUTIONS:
         rows, columns = ((max(0, size - edge + stride) // stride) for size in (rows, columns))
@@ -188,11 +188,11 @@ def image_width(image: Sequence[int]) -> int:
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """What a policy file holds.
+    """Contents of a policy file.
 
     Attributes:
-        metadata: what it says about itself.
-        tensors: name to array; shapes as ``tensor_shapes`` says.
+        metadata: description of the policy.
+        tensors: name to array; shapes as in ``tensor_shapes``.
     """
 
     metadata: Metadata
@@ -200,7 +200,7 @@ class PolicyFile:
 
     @property
     def can_resume(self) -> bool:
-        """Whether the state of the optimiser is there."""
+        """Whether the file has the state of the optimiser."""
         return STEP in self.tensors
 
     def part(self, name: str) -> Tensors:
@@ -209,18 +209,18 @@ class PolicyFile:
         return {k.removeprefix(start): v for k, v in self.tensors.items() if k.startswith(start)}
 
     def untrained(self) -> PolicyFile:
-        """The same policy, to begin another training with."""
+        """The same policy as the start of another training."""
         metadata = replace(self.metadata, timesteps=0, epochs=0)
         return replace(self.without_optimizer(), metadata=metadata)
 
     def at_half_precision(self) -> PolicyFile:
-        """The same policy with the network's numbers at 16 bits, to keep: half the size."""
+        """The same policy with 16-bit network weights, half the size, for storage."""
         tensors = self.without_optimizer().tensors
         half = {k: v.astype(np.float16) for k, v in tensors.items() if k.startswith("policy.")}
         return PolicyFile(self.metadata, tensors | half)
 
     def without_optimizer(self) -> PolicyFile:
-        """The same policy, to run alone: a third of the size."""
+        """The same policy for inference only, a third of the size."""
         kept = {k: v for k, v in self.tensors.items() if not k.startswith(_OF_TRAINING)}
         return PolicyFile(self.metadata, kept)
 
@@ -280,7 +280,7 @@ def write_policy(path: Path, policy: PolicyFile) -> None:
     """Write a policy file, as `output_files.write_bytes` does.
 
     Raises:
-        InputError: tensors that do not fit the metadata, or numbers that no training goes on from.
+        InputError: tensors that do not fit the metadata, or invalid numbers.
     """
     _check_values(path, {k: _at_least_single(v) for k, v in policy.tensors.items()})
     shapes = tensor_shapes(policy.metadata, STEP in policy.tensors)
@@ -297,7 +297,7 @@ def read_policy(path: str | Path) -> PolicyFile:
     Numbers of half precision come as float32.
 
     Raises:
-        InputError: no such file, or one that is not a policy, whole and of this version.
+        InputError: no such file, or not a complete policy file of this version.
     """
     path = Path(path)
     _check_file(path)
@@ -324,7 +324,7 @@ def _at_least_single(value: NDArray[Any]) -> NDArray[Any]:
 
 
 def _check_file(path: Path) -> None:
-    """Refuse what is no regular file of a policy's size; opening a FIFO would wait for ever."""
+    """Refuse irregular and oversized files; opening a FIFO would wait for ever."""
     if not path.exists():
         raise InputError(f"no policy file {str(path)!r}")
     if not path.is_file():

@@ -18,22 +18,22 @@ if TYPE_CHECKING:
 
 PATH_VARIABLE = "MS_SLAM_POLICY"
 SHIPPED = Path(__file__).parent / "policies"
-"""The policies that come with the package, by the agent's name."""
+"""Folder of the policies shipped with the package, named after the agents."""
 
 
 class TrainedPolicy(Planner):
-    """A policy trained by ``ms-slam train``, shown the observation that it was trained on.
+    """Acts by a policy trained with ``ms-slam train``, on the observation of its training.
 
     Args:
-        robot: what it sees.
-        seed: of the draws from the policy's probabilities.
-        path: the policy file; default: what the environment variable ``MS_SLAM_POLICY`` names.
-        deterministic: take the most probable action instead of drawing one; a truth value or the
-            text ``true`` or ``false``.
+        robot: the robot's view.
+        seed: for sampling from the policy's probabilities.
+        path: the policy file; default: the environment variable ``MS_SLAM_POLICY``.
+        deterministic: take the most probable action instead of sampling; a boolean or the text
+            ``true`` or ``false``.
 
     Raises:
         InputError: no policy file, an untrained one, one trained for another observation variant
-            or number of actions, or a ``deterministic`` that is no truth value.
+            or number of actions, or an invalid ``deterministic``.
     """
 
     default_path: Path | None = None
@@ -58,7 +58,7 @@ class TrainedPolicy(Planner):
 
     @classmethod
     def observation_for(cls, path: str | None = None, **options: Any) -> str:
-        """What the policy was trained on."""
+        """The observation variant that the policy was trained on."""
         path = cls._path(path)
         return _loaded(path, _modified(path)).metadata.observation
 
@@ -73,13 +73,13 @@ class TrainedPolicy(Planner):
         return found
 
     def reset(self) -> None:
-        """Nothing was seen yet."""
+        """Clear the policy's memory."""
         self.policy.reset()
 
     def act(self, observation: Any, info: dict[str, Any]) -> Any:
-        """Draw an unmasked action from the policy's probabilities, or take the most probable.
+        """Sample an unmasked action from the policy's probabilities, or take the most probable.
 
-        An integer, or an array of them where an action has several.
+        Returns an integer, or an array of integers where an action has several parts.
         """
         rng = None if self.deterministic else self.rng
         return self.policy.act(observation, self.robot.action_masks(), rng)
@@ -90,10 +90,9 @@ class TrainedPolicy(Planner):
 
 
 class ShippedAgent(TrainedPolicy):
-    """A policy that comes with the package; it takes the most probable action unless told not to.
+    """A policy shipped with the package; by default it takes the most probable action.
 
-    Drawn from its probabilities, the area under the F-score of `agent-room` was 5 percentage points
-    smaller.
+    With sampling, the area under the F-score curve of `agent-room` was 5 percentage points smaller.
     """
 
     def __init__(
@@ -107,24 +106,24 @@ class ShippedAgent(TrainedPolicy):
 
 
 class RoomAgent(ShippedAgent):
-    """The policy for the task ``room``, which maps; it goes back when lost."""
+    """The mapping policy for the task ``room``; undoes its last motions when lost."""
 
     recovers = True
     default_path = SHIPPED / "room.safetensors"
 
 
 class PpoAgent(ShippedAgent):
-    """A policy that PPO made from nothing, in rooms and with the arm; it goes back when lost."""
+    """A policy trained by PPO from scratch, in rooms and with the arm; backtracks when lost."""
 
     recovers = True
     default_path = SHIPPED / "ppo.safetensors"
 
 
 class PaperAgent(ShippedAgent):
-    """The policy for ``reward="paper"``: as Algorithm 1, it keeps divergences near their targets.
+    """The policy for ``reward="paper"``: like Algorithm 1, it keeps divergences near their targets.
 
-    Of each motion it sees what the greedy planner does and what else planners look at, and has
-    learned from motions that were tried what the divergence then is.
+    For each motion it sees the predictions of the greedy planner and the other values that planners
+    use. It learned from tried motions which divergence results.
     """
 
     default_path = SHIPPED / "paper.safetensors"
@@ -132,7 +131,7 @@ class PaperAgent(ShippedAgent):
 
 @lru_cache(maxsize=8)
 def _loaded(path: str, modified: float) -> PolicyFile:
-    """A policy file is read once for its observation, and not again for its network."""
+    """Read a policy file once, for both its observation and its network."""
     return read_policy(path)
 
 

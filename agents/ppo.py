@@ -1,13 +1,13 @@
-"""PPO with action masks, a memory if asked for, and a pull towards a policy to begin with.
+"""PPO with action masks, an optional memory, and a pull towards an initial policy.
 
     ms-slam train ppo --init runs/imitation/best.safetensors --observation map --out runs/ppo
 
 From top to bottom: rollout, advantages, update, run; the network is in ``network.py``. Proximal
 policy optimisation is Schulman et al. (2017); masked logits as in sb3-contrib; the memory is a
 gated recurrent unit whose state at the start of every chunk of a rollout is kept (as in recurrent
-PPO, stale by one update at most). The pull is the divergence from the first policy's probabilities,
-weighed less and less: it keeps an agent that begins as good as a planner from unlearning that
-before its value function can tell good from bad.
+PPO, stale by one update at most). The pull is the divergence from the initial policy's
+probabilities, with decreasing weight: it keeps an agent that starts as good as a planner from
+unlearning before its value function is accurate.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Rollout:
 
 
 class FirstPolicy:
-    """The policy that pulls, as it sees the world.
+    """The initial policy that pulls, with its own normalisation and memory.
 
     Args:
         network: with its parameters.
@@ -96,14 +96,14 @@ class FirstPolicy:
         self.memory = torch.zeros(num_envs, network.width)
 
     def probabilities(self, observations: Any, begins: Tensor, masks: Tensor) -> Tensor:
-        """Of the actions (B, n), by observations (B, k) that are not normalised."""
+        """Probabilities (B, n) of the actions, given raw observations (B, k)."""
         seen = torch.as_tensor(self.normalization.scaled(observations))
         self.memory = self.network.remember(seen, self.memory, begins)
         return self.network(seen, self.memory, masks)[0].exp()
 
 
 class Player:
-    """Plays the environments with the network as it is.
+    """Plays the environments with the current network.
 
     Args:
         venv: normalised environments.
@@ -136,7 +136,7 @@ class Player:
 
     @torch.no_grad()
     def play(self, steps: int, stop: Any) -> Rollout | None:
-        """A rollout; None where ``stop()`` says so before its end."""
+        """Play a rollout; return None if ``stop()`` ended it early."""
         rows: list[tuple[Tensor, ...]] = []
         self.returns, self.lengths = [], []
         if not self.has_begun:  # not before: the environments are told of their stage first
@@ -168,7 +168,7 @@ class Player:
         return rollout
 
     def _cut_off(self, dones: Any, infos: list[dict[str, Any]]) -> Tensor:
-        """What was still to come where the time limit ended an episode: the value there."""
+        """The value at the last observation of episodes that the time limit ended."""
         rest = torch.zeros(len(dones))
         for i in np.flatnonzero(dones):
             if infos[i].get("TimeLimit.truncated"):
@@ -194,7 +194,7 @@ def update(
     pull: float,
     rng: np.random.Generator,
 ) -> dict[str, float]:
-    """Learn from a rollout; means of the parts of the loss, and how far the policy went.
+    """Learn from a rollout; return the mean loss terms and the change of the policy.
 
     ``approx_kl`` (of the last epoch), ``clip_fraction`` and ``explained_variance`` are defined as
     in Stable-Baselines3.
@@ -259,7 +259,7 @@ class Run(TrainingRun):
     Args:
         args: of the training.
         venv: normalised environments.
-        file: to go on from, if there is one.
+        file: policy file to resume from, if any.
     """
 
     (algorithm,) = Args.algorithms
@@ -295,7 +295,7 @@ class Run(TrainingRun):
         return [name for name, _ in self.network.named_parameters()]
 
     def _first_policy(self, file: PolicyFile) -> FirstPolicy:
-        """The policy of ``init`` as it pulls."""
+        """The initial policy that pulls, from ``init``."""
         args, network = self.args, self._network()
         load_parameters(network, file)
         normalization = Normalization(self.inputs, self.actions, args.candidates, args.gamma)
@@ -330,7 +330,7 @@ class Run(TrainingRun):
 
 
 def make_run(args: Args, file: PolicyFile | None, stack: ExitStack) -> Run:
-    """A run in environments of its own."""
+    """Make a run and its environments."""
     venv = stack.enter_context(opened(make_venv(args, "train")))
     return Run(args, VecNormalize(VecMonitor(venv), gamma=args.gamma), file)
 

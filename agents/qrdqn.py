@@ -1,15 +1,14 @@
-"""QR-DQN with action masks: the quantiles of the return, learnt from replay.
+"""QR-DQN with action masks: quantiles of the return, learned from replay.
 
     ms-slam train qrdqn --task room --out runs/qrdqn
 
 From top to bottom: replay, play, loss, run. Quantile regression is Dabney et al. (AAAI 2018), the
 double target van Hasselt et al. (AAAI 2016), returns of several steps as in Rainbow (Hessel et al.,
-AAAI 2018). A blocked action is neither taken nor thought possible in the target. The policy takes
-the action whose quantiles have the largest mean. Observations are kept as they came and scaled when
-they are drawn, by the moments of the day.
+AAAI 2018). Blocked actions are excluded from play and from the target. The policy takes the action
+whose quantiles have the largest mean. Observations are stored raw, and normalised by the current
+moments when they are drawn.
 
-The replay is not saved: a run that goes on fills it with ``learning_starts`` steps of the policy
-that it has, and then learns on.
+The replay is not saved: a resumed run first fills it with ``learning_starts`` steps of its policy.
 """
 
 from __future__ import annotations
@@ -44,12 +43,12 @@ value there is worth: gamma to their number, 0 where the episode ended."""
 
 
 class Replay:
-    """The latest transitions.
+    """Replay buffer of the latest transitions.
 
     Args:
-        size: how many.
-        inputs: numbers of an observation.
-        actions: that there are.
+        size: number of transitions.
+        inputs: length of an observation.
+        actions: number of actions.
     """
 
     def __init__(self, size: int, inputs: int, actions: int) -> None:
@@ -67,14 +66,14 @@ class Replay:
         return min(self.size, self.added)
 
     def add(self, transition: Transition) -> None:
-        """Keep one, in the place of the oldest."""
+        """Store a transition; when full, it replaces the oldest."""
         values: tuple[Any, ...] = transition
         for column, value in zip(self.columns, values, strict=True):
             column[self.added % self.size] = value
         self.added += 1
 
     def draw(self, rng: np.random.Generator, count: int) -> list[NDArray[Any]]:
-        """So many transitions, each as probable as any other; column by column."""
+        """Draw ``count`` transitions uniformly, as columns."""
         chosen = rng.integers(len(self), size=count)
         return [column[chosen] for column in self.columns]
 
@@ -144,9 +143,9 @@ class Learner:
 
     Args:
         args: of the training.
-        normalization: by which observations and returns are seen.
-        actions: that there are.
-        file: to go on from, with its optimiser, or to begin with.
+        normalization: of observations and returns.
+        actions: number of actions.
+        file: policy file to resume from, with its optimiser, or to start from.
     """
 
     def __init__(
@@ -181,7 +180,7 @@ class Learner:
         return rewards[:, None] + worth[:, None] * quantiles
 
     def learn(self, batch: Sequence[NDArray[Any]]) -> float:
-        """A gradient step; the loss before it."""
+        """Make a gradient step; return the loss before it."""
         scale = self.normalization
         seen, after = (torch.as_tensor(scale.scaled(batch[i])) for i in (0, 3))
         rewards = torch.as_tensor(batch[2] / np.float32(scale.return_scale))
@@ -215,7 +214,7 @@ class Run(TrainingRun):
     Args:
         args: of the training.
         venv: environments, not normalised.
-        file: to go on from, if there is one.
+        file: policy file to resume from, if any.
 
     Raises:
         InputError: a policy to begin with that is no QR-DQN's.
@@ -251,7 +250,7 @@ class Run(TrainingRun):
 
     @property
     def epsilon(self) -> float:
-        """Share of random actions now."""
+        """Current share of random actions."""
         args = self.args
         done = self.steps / max(1.0, args.exploration * args.total_timesteps)
         return max(args.epsilon, 1 - (1 - args.epsilon) * done)
@@ -310,7 +309,7 @@ class Run(TrainingRun):
 
 
 def make_run(args: Args, file: PolicyFile | None, stack: ExitStack) -> Run:
-    """A run in environments of its own."""
+    """Make a run and its environments."""
     venv = stack.enter_context(opened(make_venv(args, "train")))
     return Run(args, VecMonitor(venv), file)
 

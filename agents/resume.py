@@ -1,7 +1,7 @@
-"""Go on with a run: which options its file may say, and which must be as they were.
+"""Resume a run: which options its file may set, and which must not change.
 
-A run may come from a stranger. What its file says is a number, or a name among what is installed;
-a module, a file or an address that it names is only used where the command line names it again.
+A run may come from an untrusted source. Its file may set numbers and names of installed parts; a
+module, file or address that it names is only used if the command line names it again.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ _NAMES: dict[str, Callable[[str], bool]] = {
     "through": _is_planner,
     "without": _one_of(lambda: [term.name for term in fields(RewardConfig)]),
 }
-"""Options whose text a file may say, and whether it is such a text; no file says another text."""
+"""Text options that a file may set, each with a check of the text; others it may not set."""
 
 
 def _may_say(name: str, value: Any) -> bool:
@@ -112,7 +112,7 @@ def _may_say(name: str, value: Any) -> bool:
 def parse_options(
     cls: type[P], arguments: Sequence[str], prog: str, trainer: str, algorithms: Sequence[str]
 ) -> P:
-    """Options ``cls`` of a command line; of a run to resume those that it had, where not said.
+    """Parse options ``cls`` from a command line; a resumed run keeps those not given.
 
     Args:
         cls: the options of the trainer.
@@ -178,7 +178,7 @@ def resumed(path: Path, saved: Mapping[str, Any], given: P, said: Collection[str
 
 
 def say_changes(saved: Mapping[str, Any], args: Problem) -> None:
-    """Print which options of a run are others from now on."""
+    """Print which options of a resumed run have changed."""
     for name, value in to_plain(asdict(args)).items():
         before = saved.get(name, value)
         if before != value and name not in ("out", "resume"):
@@ -189,7 +189,7 @@ def say_changes(saved: Mapping[str, Any], args: Problem) -> None:
 
 
 def check_new(out: Path, *names: str) -> None:
-    """Refuse a new run where files of these names show that there is one already.
+    """Refuse a new run in a folder that already has files of these names.
 
     Raises:
         InputError: there is one.
@@ -205,7 +205,7 @@ def check_kept(
     names: Iterable[str],
     was: str = "was trained with",
 ) -> None:
-    """Refuse to go on with a run under options that would make it another one.
+    """Refuse to resume a run with options that would make it a different one.
 
     What a run of earlier does not say, it had as an option is by default.
 
@@ -227,10 +227,10 @@ def check_kept(
 
 
 def check_steps_left(path: Path, done: int, total: int) -> None:
-    """Refuse to go on with a run that has all its steps.
+    """Refuse to resume a run that has made all its steps.
 
     Raises:
-        InputError: there is nothing left to do.
+        InputError: no steps are left.
     """
     if done >= total:
         raise InputError(

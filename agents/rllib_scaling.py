@@ -1,4 +1,4 @@
-"""Steps a second on Ray RLlib with different numbers of environment runners.
+"""Measure steps per second on Ray RLlib with different numbers of environment runners.
 
 ms-slam train rllib scaling --runners 1 2 4 --out runs/rllib-scaling
 """
@@ -59,7 +59,7 @@ def scale(args: Scaling) -> int:
 
 
 def measure(args: Scaling, count: int) -> dict[str, Any]:
-    """Steps a second with ``count`` runners, updates of the network among them."""
+    """Steps per second with ``count`` runners, including updates of the network."""
     own: dict[str, Any] = {"num_envs": count, "runners": (count,), "total_timesteps": 1_000_000_000}
     with ExitStack() as stack:
         run = make_run(replace(args, **own), None, stack)

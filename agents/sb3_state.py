@@ -1,4 +1,4 @@
-"""Between a model of Stable-Baselines3 in training and the numbers of a policy file."""
+"""Convert between a Stable-Baselines3 model in training and the tensors of a policy file."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def optimizer_tensors(parameters: list[str], state: dict[str, Any]) -> Tensors:
 
 
 def restore(model: Model, file: PolicyFile) -> None:
-    """Put a model where training stood when the file was written, but for its environments."""
+    """Load a model's training state from a policy file, except its environments."""
     network = {name: torch.from_numpy(value) for name, value in file.part("policy").items()}
     model.policy.load_state_dict(network)
     if file.can_resume:
@@ -52,7 +52,7 @@ def restore(model: Model, file: PolicyFile) -> None:
 
 
 def restore_adam(optimizer: torch.optim.Optimizer, saved: Tensors, parameters: list[str]) -> None:
-    """Put Adam where it stood; ``parameters`` are the names in its order."""
+    """Load the state of Adam; ``parameters`` are the names in its order."""
     state = optimizer.state_dict()
     state["state"] = {
         i: {"step": torch.tensor(float(saved["step"]))}

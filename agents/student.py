@@ -1,4 +1,4 @@
-"""The network that learns from a planner, and the batches that it learns from."""
+"""The network that imitates a planner, and its training batches."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Student:
     """The network that learns, with its normalisation.
 
     Args:
-        args: of the training.
-        demonstrations: of the first round, which the normalisation is taken from.
-        file: to go on from.
-        epochs: done before.
+        args: options of the training.
+        demonstrations: of the first round; they determine the normalisation.
+        file: policy file to resume from.
+        epochs: number of epochs done before.
 
     Raises:
         InputError: a file for other observations or actions.
@@ -66,9 +66,9 @@ class Student:
             load_parameters(self.network, file)
 
     def fit(self, demonstrations: Sequence[Demonstration]) -> dict[str, float]:
-        """Learn from all episodes; return the loss and the share of the teacher's choice at last.
+        """Learn from all episodes; return the final loss and probability of its choices.
 
-        The loss is the cross entropy to what the teacher prefers.
+        The loss is the cross entropy to the teacher's preferences.
         """
         args = self.args
         data = Batches(demonstrations, args, np.random.default_rng([args.seed, self.epochs]))
@@ -80,7 +80,7 @@ class Student:
             can = torch.as_tensor(masks)
             empty, begins = torch.zeros(seen.shape[1], args.memory), torch.zeros(seen.shape[:2])
             log_probs, values = self.network.along(seen, empty, begins, can)
-            log_probs = log_probs.masked_fill(~can.flatten(0, 1), 0)  # of what cannot be: nothing
+            log_probs = log_probs.masked_fill(~can.flatten(0, 1), 0)  # blocked actions do not count
             log_probs, values = log_probs[is_step], values[is_step]
             wanted = torch.as_tensor(preferences, dtype=torch.float32)
             scale = self.normalization.return_scale
@@ -99,7 +99,7 @@ class Student:
         return {"loss": float(losses.mean()), "probability": float(np.nanmean(probabilities))}
 
     def file(self, timesteps: int, minutes: float) -> PolicyFile:
-        """The policy as it is now."""
+        """The current policy."""
         args = self.args
         metadata = metadata_of(
             args,

@@ -1,4 +1,4 @@
-"""Watches a training run: ends it by the clock or a signal, saves and judges the policy."""
+"""Supervise a training run: stop by the clock or a signal, save and evaluate the policy."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Supervisor(BaseCallback):
     Args:
         args: of the training script.
         validation: environments of ``FixedEpisodes``.
-        curve: so far.
-        minutes_before: trained by the runs that this one goes on from.
+        curve: the learning curve so far.
+        minutes_before: minutes trained by the runs that this one resumes.
     """
 
     model: Model
@@ -47,7 +47,7 @@ class Supervisor(BaseCallback):
         self.signal: signal.Signals | None = None
         self.unlearnt_steps = 0
         self.was_done = False
-        """Whether nothing but the last evaluation was left to do."""
+        """Whether only the last evaluation remained."""
         self._minutes_before = minutes_before
         self._evaluation_s = 0.0
         self._provenance = provenance()
@@ -142,7 +142,7 @@ class Supervisor(BaseCallback):
         write_policy(self.args.out / LATEST, self.policy_file())
 
     def policy_file(self) -> PolicyFile:
-        """The policy as it is now, with the state of the optimiser."""
+        """The current policy, with the state of the optimiser."""
         space = self.training_env.observation_space
         assert space.shape is not None
         metadata = metadata_of(

@@ -1,4 +1,4 @@
-"""A learner within a planner: the planner's own decisions leave it no choice."""
+"""Train a policy within a planner, which leaves no choice where it decides itself."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _STREAM = 3  # of an episode's seed, for the planner; the environment draws from
 
 
 class ThroughPlanner(gym.Wrapper[Any, Any, Any, Any]):
-    """Allows a learner what a planner would let its policy choose from.
+    """Restricts a learner to the actions that a planner offers its policy.
 
-    Where the planner decides by itself, as `agent-home` on the way to a goal, its action is the
-    only one. That has probability one whatever the policy is: it is not learned from, while the
-    values of what was chosen before have in them where it led, in the time that it took.
+    Where the planner decides itself, such as `agent-home` on the way to a goal, its action is the
+    only one permitted. It has probability one for any policy, so nothing is learned from it, while
+    the values of earlier choices include its outcome and duration.
 
     Args:
         env: to act in.

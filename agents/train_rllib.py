@@ -220,7 +220,7 @@ class Run(TrainingRun):
 
     Args:
         args: of the training.
-        file: to go on from, if there is one.
+        file: policy file to resume from, if any.
 
     Raises:
         InputError: a policy to begin with that is of another network.
@@ -245,7 +245,7 @@ class Run(TrainingRun):
         return result.get()
 
     def _sync(self) -> None:
-        """Give the runners what the learner has."""
+        """Send the learner's weights and moments to the runners."""
         self.ppo.env_runner_group.sync_weights(
             from_worker_or_learner_group=self.ppo.learner_group, inference_only=True
         )
@@ -260,7 +260,7 @@ class Run(TrainingRun):
         self.ppo.env_runner_group.foreach_env_runner(enter)
 
     def advance(self, stop: Callable[[], bool]) -> dict[str, float] | None:
-        """Let the runners play and the learner learn once."""
+        """Run one round: the runners play, and the learner learns."""
         if stop():
             return None
         result = self.ppo.train()
@@ -301,7 +301,7 @@ def learner_tensors(learner: Any) -> Tensors:
 
 
 def restore_learner(learner: Any, file: PolicyFile) -> None:
-    """Put RLlib's learner where it stood when the file was written."""
+    """Load the state of RLlib's learner from a policy file."""
     module: MaskedModule = learner.module[MODULE].unwrapped()
     normalization = module.fresh_normalization()
     expected = {n: tuple(p.shape) for n, p in module.network.named_parameters()}
@@ -333,7 +333,7 @@ def start_ray(args: Args, stack: ExitStack) -> None:
 
 
 def make_run(args: Args, file: PolicyFile | None, stack: ExitStack) -> Run:
-    """A run on the cluster that there is, or on one of its own."""
+    """Make a run on the existing Ray cluster, or on a new one."""
     start_ray(args, stack)
     run = Run(args, file)
     stack.callback(run.close)

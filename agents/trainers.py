@@ -1,6 +1,6 @@
-"""``ms-slam train NAME``: the options of each trainer, and what trains once they are right.
+"""``ms-slam train NAME``: the options of each trainer, and the call of the trainer.
 
-Torch, Stable-Baselines3 and Ray take seconds to load: an option that is refused waits for none.
+Torch, Stable-Baselines3 and Ray take seconds to load, so options are checked before that.
 """
 
 from __future__ import annotations
@@ -53,24 +53,24 @@ class ImitationArgs(Problem):
 
     Attributes:
         teacher: a planner, NAME,option=value,...
-        init: policy file to begin with, its network and normalisation; it may be of another task.
-        through: planner that the policy acts through in the rounds after the first, as its option
-            ``path``: `agent-home` has goals for the way to what is not near by. Then only the
-            decisions count that the teacher weighs. None: the policy acts by itself.
-        rounds: of episodes and fitting; in the first the teacher acts.
-        episodes: of each round.
-        share: of the decisions that are the teacher's in the second round; half as many in each
-            round after it.
-        epochs: passes over all episodes so far, each round.
-        batch_size: of the gradient steps.
+        init: policy file to start from, its network and normalisation; it may be of another task.
+        through: planner through which the policy acts after the first round, as its option
+            ``path``; `agent-home` goes to distant goals itself. Only decisions that the teacher
+            rates are then learned from. None: the policy acts by itself.
+        rounds: number of rounds of episodes and fitting; in the first the teacher acts.
+        episodes: number of episodes per round.
+        share: share of the decisions that the teacher makes in the second round; it halves in each
+            further round.
+        epochs: passes over all episodes so far, in each round.
+        batch_size: steps per gradient step.
         learning_rate: of Adam.
-        value_weight: of the error of the value in the loss.
+        value_weight: weight of the value error in the loss.
         gamma: discount factor of the returns.
         hidden: width of the two hidden layers.
-        dropout: share of what the layers see that is zero, drawn anew for each gradient step.
-        memory: width of the recurrent unit; 0: the policy sees the present observation alone. With
-            one, a batch is of whole episodes, as many as have ``batch_size`` steps together, one
-            at least.
+        dropout: share of the layers' input set to zero, drawn for each gradient step.
+        memory: width of the recurrent unit; 0: the policy sees only the present observation. With a
+            memory, a batch is whole episodes with about ``batch_size`` steps together, at least
+            one.
     """
 
     out: Path = Path("runs/imitation")
@@ -102,9 +102,9 @@ class PpoArgs(PpoTraining):
     """Train with masked PPO, with memory or without; these options are the command line.
 
     Attributes:
-        pull: weight of the divergence from the first policy, at the start; it falls to 0 linearly.
-        pull_steps: environment steps until then.
-        memory: width of the recurrent unit; 0: the policy sees the present observation alone.
+        pull: initial weight of the divergence from the initial policy; it falls linearly to 0.
+        pull_steps: environment steps until the weight is 0.
+        memory: width of the recurrent unit; 0: the policy sees only the present observation.
         chunk: steps over which gradients go back through the memory; ``n_steps`` is a multiple.
         value_weight: of the error of the value in the loss.
     """
@@ -138,16 +138,16 @@ class QrdqnArgs(Training):
     """Train with masked QR-DQN; these options are the command line.
 
     Attributes:
-        quantiles: of the return of each action.
-        n_step: rewards of a return before the target network's word is taken.
+        quantiles: number of quantiles of the return per action.
+        n_step: number of rewards in a return before the target network's estimate is used.
         buffer_size: transitions kept; each holds two observations of 4-byte numbers.
         batch_size: of the gradient steps, in transitions.
         learning_starts: environment steps before the first gradient step, of each run.
         train_every: environment steps between gradient steps.
         target_every: gradient steps between copies of the network to the target's.
-        epsilon: share of random actions in the end, from 1 at the start.
-        exploration: share of ``total_timesteps`` until then.
-        save_every: environment steps between savings.
+        epsilon: final share of random actions, from 1 at the start.
+        exploration: share of ``total_timesteps`` over which the share of random actions falls.
+        save_every: environment steps between saved files.
     """
 
     out: Path = Path("runs/qrdqn")
@@ -211,12 +211,12 @@ class RllibArgs(PpoTraining):
 
 @dataclass(frozen=True)
 class RllibScaling(RllibArgs):
-    """Measure steps a second with different numbers of runners; these options are the command line.
+    """Measure steps per second with several numbers of runners; these options are the command line.
 
     Attributes:
-        runners: numbers of environment runners, one after the other.
-        rounds: of ``n_steps`` steps of each runner and an update, that are measured; one more comes
-            before, in which scenes are built and kernels loaded.
+        runners: numbers of environment runners to measure, one after the other.
+        rounds: measured rounds of ``n_steps`` steps per runner and an update, after one round of
+            warm-up, in which scenes are built and kernels loaded.
     """
 
     out: Path = Path("runs/rllib-scaling")

@@ -1,5 +1,5 @@
-"""What training scripts have in common: to go on from a file, to learn until the steps are made, to
-save after each update and judge every so often, to stop by the clock or a signal."""
+"""Base of the training scripts: resume from a file, learn until the steps are made, save after each
+update, evaluate regularly, and stop by the clock or a signal."""
 
 from __future__ import annotations
 
@@ -51,20 +51,20 @@ T = TypeVar("T", bound=Training)
 Train = TypeVar("Train", bound=Callable[..., int])
 
 _MEASURES = ("approx_kl", "clip_fraction", "explained_variance", "episode_length")
-"""What TensorBoard shows and the progress bar has no room for."""
+"""Measures shown in TensorBoard but not in the progress bar."""
 
 
 class TrainingRun(ABC):
-    """A training run: what it has learnt, and what of it is on disk.
+    """A training run and its files.
 
     Args:
         args: of the training.
         observations: the environments' space.
         actions: the environments' space.
-        file: to go on from, if there is one.
+        file: policy file to resume from, if any.
 
     Raises:
-        InputError: an action of several numbers.
+        InputError: an action of several parts.
     """
 
     algorithm: ClassVar[str]
@@ -90,19 +90,19 @@ class TrainingRun(ABC):
         """Play and learn for a while, counting ``steps`` and ``epochs``.
 
         Returns:
-            What there is to say of it; None where ``stop()`` said so before its end.
+            Measures to report; None if ``stop()`` ended it early.
         """
 
     def enter_stage(self, stage: int) -> None:
-        """Let the environments be of a stage of the curriculum from their next episodes on."""
+        """Switch the environments to a stage of the curriculum at their next episodes."""
         self.venv.env_method("enter_stage", stage)
 
     @abstractmethod
     def tensors(self) -> Tensors:
-        """The policy as it is now, with the state of the optimiser."""
+        """The current policy, with the state of the optimiser."""
 
     def metadata(self) -> Metadata:
-        """What the file says about the policy as it is now."""
+        """Metadata of the current policy."""
         return metadata_of(
             self.options,
             self.algorithm,
@@ -117,15 +117,15 @@ class TrainingRun(ABC):
         )
 
     def file(self) -> PolicyFile:
-        """The policy as it is now, with the state of the optimiser."""
+        """The current policy, with the state of the optimiser."""
         return PolicyFile(self.metadata(), self.tensors())
 
     def learn(self, curve: Curve, validation: VecEnv) -> signal.Signals | None:
         """Advance until the steps are made, or time is up.
 
         Returns:
-            The signal that ended it sooner, if one did. One that comes during an evaluation ends
-            that by KeyboardInterrupt: it may take minutes.
+            The signal that ended it early, if any. A signal during an evaluation, which may take
+            minutes, raises KeyboardInterrupt.
         """
         args, before = self.options, self.minutes
         board = SummaryWriter(str(own_folder(args.out / "tensorboard")))
@@ -169,7 +169,7 @@ class TrainingRun(ABC):
         return signals[0] if signals else None
 
     def _judge(self, curve: Curve, validation: VecEnv, board: SummaryWriter) -> None:
-        """Evaluate, and keep what is best so far."""
+        """Evaluate, and keep the best policy so far."""
         file = self.file().without_optimizer()
         point = curve.judge(file, validation, self.options.out, self.options.deterministic_eval)
         for name in point.keys() - {"returns", "timesteps", "training_min"}:
@@ -196,7 +196,7 @@ def train_run(
 
     Args:
         args: of the training.
-        algorithm: what the run's policy file says that it is of.
+        algorithm: value of ``algorithm`` in the run's policy file.
         make: makes the run, new or from a file, and lets the stack close what it opens.
 
     Raises:
@@ -224,7 +224,7 @@ def train_run(
 
 @contextmanager
 def caught_signals(tell: Callable[[signal.Signals], Any]) -> Iterator[None]:
-    """While this lasts, SIGINT and SIGTERM are but told; a second one ends at once."""
+    """Record SIGINT and SIGTERM instead of stopping; a second one stops at once."""
     before: dict[int, Any] = {}
 
     def handle(number: int, _: object) -> None:
@@ -241,7 +241,7 @@ def caught_signals(tell: Callable[[signal.Signals], Any]) -> Iterator[None]:
 
 
 def stage_of(args: Training, steps: int, curve: Curve) -> int:
-    """The stage of the curriculum after so many steps."""
+    """The current stage of the curriculum."""
     assert args.curriculum
     return stage_now(read_curriculum(args.curriculum), steps, curve.points, args.total_timesteps)
 
@@ -260,7 +260,7 @@ def metadata_of(args: Any, algorithm: str, **counts: Any) -> Metadata:
 
 
 def load_run(args: Training, algorithm: str, curve: Curve | None) -> PolicyFile | None:
-    """What there is to resume; None for a new run.
+    """Load the run to resume from; None for a new run.
 
     Raises:
         InputError: nothing to resume from, nothing left to train or to judge, another network or
@@ -308,7 +308,7 @@ def saved_curve(args: Problem) -> Curve | None:
 
 
 def new_curve(args: Training, validation: VecEnv) -> Curve:
-    """A learning curve without points, with the references that are asked for."""
+    """A learning curve without points, with the requested references."""
     known = references(validation, args.eval_episodes) if args.references else {}
     return Curve(args.eval_episodes, known, config=to_plain(asdict(args)))
 
@@ -324,7 +324,7 @@ def read_init(args: Training) -> PolicyFile:
 
 
 def read_similar(path: Path, args: Problem, hidden: int) -> PolicyFile:
-    """A policy of any task, with the observation and layers of ``args``, ``hidden`` wide.
+    """Read a policy of any task with the observation and layers of ``args``, ``hidden`` wide.
 
     Raises:
         InputError: no policy, or another one.

@@ -1,4 +1,4 @@
-"""Planners that choose camera motions without learning, one file each."""
+"""Planners that do not learn, one file each."""
 
 from ms_slam_baselines.belief import Belief
 from ms_slam_baselines.foresight import Foresight

@@ -1,4 +1,4 @@
-"""Belief-space planning: surface that will be in its right place, and a pose that stays known."""
+"""Belief-space planning: map surface in its true place, and keep the pose certain."""
 
 from __future__ import annotations
 
@@ -20,31 +20,32 @@ if TYPE_CHECKING:
     from ms_slam_env.env.robot_view import RobotView
 
 CORRECT_M = 0.05
-"""How far from its place surface may be to count."""
-_COMPARED = 6  # goals whose way is predicted
-_STOPS = 2  # views predicted on a way
+"""Largest error of surface that counts as correct."""
+_COMPARED = 6  # goals whose paths are predicted
+_STOPS = 2  # views predicted on a path
 _DRIFT = np.diag([2e-3**2] * 3 + [2e-3**2] * 3)
-"""Q: what one motion adds to the covariance, m^2 and rad^2; the RPE of a step in `living_room`."""
-_START = np.diag([1e-3**2] * 6)  # where SLAM gave no covariance yet
+"""Q: covariance added by one motion, m^2 and rad^2; the RPE of a step in `living_room`."""
+_START = np.diag([1e-3**2] * 6)  # until SLAM gives a covariance
 
 
 class Belief(NextBestView):
-    """Goes where most surface is expected to be mapped within 5 cm of its place.
+    """Goes where it expects to map most surface within 5 cm of its true place.
 
-    The covariance of the pose is carried along the way to a goal,
+    The pose covariance is propagated along the path to a goal,
 
         Sigma <- Ad Sigma Ad^T + Q,    Sigma <- (Sigma^-1 + f H)^-1,
 
-    for every motion and every view on the way, H the information of the view that the map predicts
-    and f such that f H is, of the present view, what SLAM itself says of its pose. A goal is worth
-    its gain (as in `nbv`) times the probability that a point in the middle of its view lands within
-    5 cm: that SLAM slips nowhere on the way (see `trackability`), and that the Gaussian error is
-    small enough. Less ``caution`` times the best gain for every (5 cm)^2 by which det(Sigma)^(1/6)
-    grows (Carrillo, Reid, Castellanos, ICRA 2012, on D-optimality).
+    for every motion and every view on the way. H is the information of the predicted view, and f
+    is such that, for the present view, f H is the information that SLAM reports for its pose. The
+    value of a goal is its gain (as in `nbv`) times the probability that a point in the middle of
+    its view lands within 5 cm of its place: that SLAM does not slip on the way (see
+    `trackability`), and that the Gaussian error is small enough. ``caution`` times the best gain is
+    subtracted for every (5 cm)^2 by which det(Sigma)^(1/6) grows (Carrillo, Reid, Castellanos, ICRA
+    2012, on D-optimality).
 
     Args:
-        robot: what it sees.
-        seed: of the goals drawn.
+        robot: the robot's view.
+        seed: for drawing goals.
         caution: price of uncertainty, see above.
         **options: see `NextBestView`.
 
@@ -60,7 +61,7 @@ class Belief(NextBestView):
         self.check({"caution": (0, 1e6)})
 
     def choose_goal(self, here: Float64) -> Float64:
-        """The pose (4, 4) whose expected correct surface is most worth its way and its doubt."""
+        """The goal pose (4, 4) with the best expected surface, path cost and uncertainty."""
         poses, worth = self.drawn_goals(here)
         best = np.argsort(-worth * self.is_new(poses, here))[:_COMPARED]
         ways = np.stack([poses_between(here, poses[n], _STOPS) for n in best])
@@ -71,16 +72,16 @@ class Belief(NextBestView):
         return poses[best[int(np.argmax(value))]]
 
     def along(self, ways: Float64, views: Views, distances: Float64) -> tuple[Float64, Float64]:
-        """What comes of the pose on K ways of S stops.
+        """Predict the pose uncertainty at the end of K paths of S stops.
 
         Args:
             ways: (K, S, 4, 4) poses.
-            views: 1 + K S, of here and of all stops.
-            distances: (K, 2) translations and rotations that a way takes.
+            views: 1 + K S, from the current pose and all stops.
+            distances: (K, 2) steps of translation and of rotation that a path takes.
 
         Returns:
-            the probability (K,) that surface seen from the end lands within 5 cm, and by how much
-            the D-optimality (K,) of the covariance has grown.
+            The probability (K,) that surface seen from the end lands within 5 cm, and the growth of
+            the covariance's D-optimality (K,).
         """
         covariance, count = self.robot.pose_covariance, ways.shape[1]
         start = _START if covariance is None else np.array(covariance)
@@ -106,28 +107,28 @@ class Belief(NextBestView):
 
 
 def in_metres_and_radians(H: Float64, depth_m: Float64) -> Float64:
-    """Information (N, 6, 6) of the twist (rho, phi), from that of views with mean depths (N,)."""
+    """Convert information of views with mean depths (N,) to that (N, 6, 6) of twist (rho, phi)."""
     scale = np.ones((len(H), 6))
     scale[:, 3:] = depth_m[:, None]
     return np.asarray(H * scale[:, :, None] * scale[:, None, :])
 
 
 def trust(covariance: Float64, information: Float64) -> float:
-    """f: how many times the ``information`` (6, 6) of the present view SLAM's pose is sure of it.
+    """f: ratio of the information in SLAM's pose to the ``information`` (6, 6) of its view.
 
-    By determinants, which compare all directions at once.
+    Compares determinants, and so all directions at once.
     """
     return 1 / max(d_optimality(covariance) * d_optimality(information), 1e-9)
 
 
 def propagated(covariance: Float64, way: list[Float64], H: Float64, motions: float) -> Float64:
-    """Covariance (6, 6) at the end of a way.
+    """Covariance (6, 6) at the end of a path.
 
     Args:
-        covariance: at its start, of the twist (rho, phi) in the camera's frame.
+        covariance: at its start, of the twist (rho, phi) in the camera frame.
         way: poses (S + 1) from the start to the end.
         H: (S, 6, 6) information of the views after the start.
-        motions: made between two of the poses.
+        motions: number of motions between two of the poses.
     """
     for before, after, information in zip(way, way[1:], H, strict=False):
         Ad = adjoint(invert(after) @ before)
@@ -143,10 +144,11 @@ def d_optimality(matrix: Float64) -> float:
 
 
 def probability_within(covariance: Float64, depth_m: float, radius_m: float = CORRECT_M) -> float:
-    """Probability that a point on the axis at a depth lands within a radius of its place.
+    """Probability that a point on the optical axis at a depth lands within a radius of its place.
 
-    Its error is Gaussian with covariance J Sigma J^T, J = [I | -p x]; here with the mean of the
-    three variances in every direction, for which the probability is that of a chi of three degrees.
+    Its error is Gaussian with covariance J Sigma J^T, J = [I | -p x]. The mean of the three
+    variances is used in every direction, so that the error follows a chi distribution with three
+    degrees of freedom.
     """
     J = np.hstack([np.eye(3), hat([0, 0, -depth_m])])
     sigma = math.sqrt(max(np.trace(J @ covariance @ J.T) / 3, 1e-18))

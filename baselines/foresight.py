@@ -1,4 +1,4 @@
-"""A planner that tries every motion before it makes one: a teacher for any reward."""
+"""A planner that tries motions in the simulator before it makes one: a teacher for any reward."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ TERMS = tuple(field.name for field in fields(RewardConfig))
 
 
 class Foresight(PrivilegedPlanner):
-    """Makes the motion with the largest reward, having tried them in the simulator.
+    """Tries motions in the simulator and makes the one with the largest reward.
 
-    One step ahead, whatever the reward is. No rival, since a robot cannot take a motion back: it
-    says what there is to gain, and an agent can learn from it (see `oracle`).
+    Looks one step ahead, for any reward. Since a robot cannot undo a motion, it is an upper bound
+    rather than a competitor, and a teacher for agents (see `oracle`).
 
     Args:
-        robot: what it sees, the truth included.
-        seed: of the motions drawn.
-        tried: how many of the possible motions are tried.
-        order: which: ``random`` draws anew for each decision, ``greedy`` takes those whose
-            predicted divergences are nearest to the targets.
-        noise: by how much the term ``trajectory_error`` counts as nearer to zero than it is: in
-            an episode its sum is the error at the end, so that what is small at one step the next
-            ones take back, and what is large is a slip.
-        temperature: reward that a motion may lack to be 1/e as good a choice as the best.
-        without: terms of the reward that do not count, joined by ``+``: what does each buy?
+        robot: the robot's view, including the truth.
+        seed: for drawing motions.
+        tried: number of possible motions that are tried.
+        order: which motions: ``random`` draws them again for each decision, ``greedy`` takes those
+            whose predicted divergences are nearest to the targets.
+        noise: how far the term ``trajectory_error`` is shrunk towards zero. Over an episode its sum
+            is the final error, so small values at one step are undone by the next ones, while large
+            ones are slips.
+        temperature: reward deficit at which a motion is 1/e as good a choice as the best.
+        without: reward terms to ignore, joined by ``+``, to test what each contributes.
 
     Raises:
-        InputError: an option out of its range, an order or a term that there is not.
+        InputError: an option out of its range, or an unknown order or term.
     """
 
     motions_only = True
@@ -73,7 +73,7 @@ class Foresight(PrivilegedPlanner):
         self.weights: Float64 | None = None
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
-        """Try some motions, take the best of them."""
+        """Try some motions and return the best."""
         possible = self._first(np.flatnonzero(self.robot.action_masks()))
         rewards = np.array([self._worth(terms) for terms in self.robot.foresee_terms(possible)])
         self.weights = np.zeros(len(self.robot.action_masks()))
@@ -81,7 +81,7 @@ class Foresight(PrivilegedPlanner):
         return int(possible[np.argmax(rewards)])
 
     def _first(self, possible: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Those of the possible motions that are tried."""
+        """The possible motions to try."""
         if self.order == "greedy":
             predicted = self.robot.lookahead()[possible].T
             order = np.argsort(distance_to_targets(*predicted, self.robot.targets))
@@ -90,11 +90,11 @@ class Foresight(PrivilegedPlanner):
         return possible[order[: self.tried]]
 
     def _worth(self, terms: dict[str, float]) -> float:
-        """The sum of the terms that count, without what is noise of one of them."""
+        """Sum of the terms that count, with the noise of ``trajectory_error`` removed."""
         terms = {name: term for name, term in terms.items() if name not in self.without}
-        growth = terms.get("trajectory_error", 0.0)  # a reward of the user's own may have none
+        growth = terms.get("trajectory_error", 0.0)  # a user-defined reward may have none
         return sum(terms.values()) - float(np.clip(growth, -self.noise, self.noise))
 
     def preferences(self) -> Float64 | None:
-        """Probabilities (n,) of the motions, by their rewards; none of those not tried."""
+        """Probabilities (n,) of the motions by their rewards; 0 for those not tried."""
         return None if self.weights is None else self.weights / self.weights.sum()

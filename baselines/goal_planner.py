@@ -1,4 +1,4 @@
-"""Planners that go to views: what they know of space, how they draw and keep a goal."""
+"""Base of the planners that go to views: occupancy, and how goals are drawn and kept."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from ms_slam_env.env.robot_view import RobotView
 
 
-ARRIVED = 3  # steps from a goal
-KEPT_AWAY = 0.7  # steps from where tracking was lost
-_LEAST = 1e-6  # metres or radians of a step, which is divided by
-_SAME = 0.5  # steps within which a pose is one where the camera has been
+ARRIVED = 3  # steps from a goal at which it counts as reached
+KEPT_AWAY = 0.7  # steps to keep from poses where tracking was lost
+_LEAST = 1e-6  # least metres or radians of a step, to avoid division by zero
+_SAME = 0.5  # steps within which a pose counts as visited
 _LOOKAHEAD = 6  # positions of a way that are looked ahead
 _RANGES = {
     **{"goals": (3, 10_000), "radius_m": (0.1, 100), "cost": (0, 100)},
@@ -34,24 +34,24 @@ _RANGES = {
 
 
 class GoalPlanner(Planner):
-    """Carves the frames that were tracked, draws a goal now and then, and moves towards it.
+    """Carves tracked frames into an occupancy grid, draws goals, and moves towards them.
 
-    A goal is a pose of known free space. By default it is the one with the largest expected gain
-    against its distance in steps (Bircher et al., ICRA 2016, weigh gain by exp(-lambda cost)).
-    Where that would gain too little the goal is the one that gains most a step of the way round
-    the walls, wherever in known free space (as Dang et al., J. Field Robotics 2020, do globally).
+    A goal is a pose in known free space. By default it is the one with the best expected gain for
+    its distance in steps (Bircher et al., ICRA 2016, weigh gain by exp(-lambda cost)). If that
+    gains too little, the goal is the one anywhere in known free space with the most gain per step
+    of its path (as Dang et al., J. Field Robotics 2020, do globally).
 
     Args:
-        robot: what it sees.
-        seed: of the goals drawn.
-        goals: positions drawn for a goal.
-        radius_m: how far a goal may be.
-        cost: how much less a view is worth six steps farther away: exp(-cost).
-        replan: steps after which a goal is drawn anew.
+        robot: the robot's view.
+        seed: for drawing goals.
+        goals: number of positions drawn to choose a goal from.
+        radius_m: largest distance of a goal.
+        cost: a view six steps farther away is worth exp(-cost) times as much.
+        replan: steps after which a new goal is drawn.
         cell_m: edge of a cell of the occupancy grid.
-        reach_m: depth up to which a frame tells what is free or occupied.
-        enough_m3: unknown volume that a goal near by should show.
-        far_m: how far a goal may be where none near by does.
+        reach_m: depth up to which a frame marks cells as free or occupied.
+        enough_m3: unknown volume that a nearby goal should show.
+        far_m: largest distance of a goal if no nearby one shows enough.
 
     Raises:
         InputError: an option out of its range.
@@ -82,43 +82,43 @@ class GoalPlanner(Planner):
         self.reset()
 
     def check(self, ranges: Mapping[str, tuple[float, float]], *counted: str) -> None:
-        """Refuse options outside ``ranges``, and fractions of those that are ``counted``."""
+        """Refuse options outside ``ranges``, and fractional values of those in ``counted``."""
         for name, (low, high) in ranges.items():
             check_range(self, name, low, high)
         for name in counted:
             check_whole(self, name)
 
     def reset(self) -> None:
-        """Nothing is known yet."""
+        """Forget the last episode."""
         self.map = OccupancyMap(self.cell_m, self.reach_m)
         self.goal: Float64 | None = None
         self.age = 0
         self.way = np.zeros((0, 3))
-        """Positions (K, 3) of the way to the goal."""
+        """Positions (K, 3) of the path to the goal."""
         self.lost_at = np.zeros((0, 4, 4))
         """Poses (N, 4, 4) at which tracking was lost."""
         self.done_with = np.zeros((0, 4, 4))
         """Goals (N, 4, 4) that were reached or given up."""
         self.given_up = 0
-        """How many since the last one reached."""
+        """Number of goals since the last one reached."""
         self.begun = 0.0
-        """Motions to the goal when it was chosen, or last looked at."""
+        """Motions to the goal when it was chosen or last checked."""
         self.passed: list[Float64] = []
-        """Poses (4, 4) where motions were chosen for what they show near by."""
+        """Poses (4, 4) at which motions were chosen for their nearby gain."""
         self.leaves = False
-        """Whether it goes to a goal since such motions led back to where it had been."""
+        """Whether it goes to a goal because such motions led back to a visited pose."""
 
     def instead(self, action: int) -> None:
-        """Remember where the motion that was made leads."""
+        """Record where the motion that was made leads."""
         self.heading_to = self.robot.candidate_poses()[action]
 
     def lost_by(self, action: int) -> None:
-        """Keep away from where the last motion should have led."""
+        """Keep away from the end of the last motion."""
         self.lost_at = np.concatenate([self.lost_at, self.heading_to[None]])
         self.goal, self.passed = None, []
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
-        """Carve the last frame, choose a motion."""
+        """Carve the last frame and choose a motion."""
         here = self.robot.T_world_camera_estimate
         if info["tracking_ok"]:
             self.map.add(self.robot, self.robot.last_frame.depth, here, self.robot.intrinsics)
@@ -129,23 +129,23 @@ class GoalPlanner(Planner):
         return action
 
     def choose_motion(self, here: Float64) -> int:
-        """The motion to make next from a pose (4, 4): towards the goal, which is kept or drawn."""
+        """The next motion from a pose (4, 4), towards the present goal or a new one."""
         if self.goal is not None:
             self.judge_goal(here)
         return self.go_to_goal(here)
 
     def go_to_goal(self, here: Float64) -> int:
-        """The motion towards the goal, or towards one that is drawn now if there is none."""
+        """The motion towards the goal; draws a goal if there is none."""
         if self.goal is None:
             self.find_goal(here)
         self.age += 1
         return self.motion_towards(self.next_on_way(here))
 
     def must_leave(self, here: Float64) -> bool:
-        """Whether to go to a goal, whatever there is to be seen near by.
+        """Whether to go to a goal regardless of nearby gain.
 
-        What is best near by may be out of reach for SLAM or for the camera, and the next best lead
-        there and back for ever. Once the camera is where it has been it goes to a goal first.
+        The best nearby view may be out of reach for SLAM or the camera, and the next best ones may
+        lead back and forth for ever. Once the camera revisits a pose, it goes to a goal first.
         """
         if self.leaves and self.goal is not None:
             self.judge_goal(here)
@@ -158,7 +158,7 @@ class GoalPlanner(Planner):
         return self.leaves
 
     def find_goal(self, here: Float64) -> None:
-        """Take a goal near by, or a far one where that would gain too little, and the way there."""
+        """Choose a nearby goal, or a far one if that gains too little, and the path to it."""
         self.ways = shortest_ways(self.map.grid, here[:3, 3], self.radius_m)
         goal = self.choose_goal(here)
         if self.gain_of(goal[None])[0] < self.enough_m3:
@@ -169,7 +169,7 @@ class GoalPlanner(Planner):
         self.begun = self.steps_to_goal(here)
 
     def judge_goal(self, here: Float64) -> None:
-        """Drop the goal where it is reached, comes no nearer, or is old and not far."""
+        """Drop the goal if it is reached, comes no nearer, or is old and not far."""
         assert self.goal is not None
         left = self.steps_to_goal(here)
         is_far = self.metres_left(here) > self.radius_m
@@ -184,18 +184,18 @@ class GoalPlanner(Planner):
             self.begun, self.age = left, 0
 
     def steps_to_goal(self, here: Float64) -> float:
-        """Motions that it takes from a pose (4, 4) to the goal along its way, one after another."""
+        """Number of motions from a pose (4, 4) to the goal along its path."""
         assert self.goal is not None
         straight, turns = distance_in_steps(here[None], self.goal, *self.steps)[0]
         return float(max(straight, self.metres_left(here) / self.steps[0]) + turns)
 
     def metres_left(self, here: Float64) -> float:
-        """Length of what is left of the way from a pose (4, 4)."""
+        """Remaining length of the path from a pose (4, 4)."""
         ahead = self.way[_nearest(self.way, here[:3, 3]) :]
         return float(np.linalg.norm(np.diff(ahead, axis=0), axis=1).sum())
 
     def next_on_way(self, here: Float64) -> Float64:
-        """The goal, or a pose (4, 4) on the way to it as far as the camera can go straight."""
+        """The goal, or the farthest pose (4, 4) on the path that can be reached straight."""
         assert self.goal is not None
         ahead = self.way[_nearest(self.way, here[:3, 3]) :]
         shares = np.linspace(0, 1, 2 * _LOOKAHEAD)[:, None, None]
@@ -216,18 +216,18 @@ class GoalPlanner(Planner):
         return expected_gain(self.map.grid, poses, self.robot.intrinsics)
 
     def is_new(self, goals: Float64, here: Float64) -> NDArray[np.bool_]:
-        """Which goals (N, 4, 4) are neither where the camera is (4, 4) nor done with."""
+        """Which goals (N, 4, 4) are neither at the camera's pose (4, 4) nor done with."""
         known = np.concatenate([here[None], self.done_with])
         away = [distance_in_steps(goals, pose, *self.steps).sum(axis=1) for pose in known]
         return np.asarray(np.min(away, axis=0) >= ARRIVED)
 
     def choose_goal(self, here: Float64) -> Float64:
-        """The pose (4, 4) whose gain is most worth its way from ``here`` (4, 4)."""
+        """The goal pose (4, 4) with the best gain for its distance from ``here`` (4, 4)."""
         poses, worth = self.drawn_goals(here)
         return poses[np.argmax(worth * self.is_new(poses, here))]
 
     def drawn_goals(self, here: Float64) -> tuple[Float64, Float64]:
-        """Poses (N, 4, 4) drawn for a goal near by, and their gain against their way (N,), m^3."""
+        """Poses (N, 4, 4) drawn as nearby goals, and their gain weighted by distance (N,), m^3."""
         drawn = self.rng.integers(len(self.ways.positions), size=self.goals)
         lengths = np.concatenate([np.zeros(self.goals // 3), self.ways.lengths[drawn]])
         positions = np.concatenate(
@@ -239,7 +239,7 @@ class GoalPlanner(Planner):
         return poses, self.gain_of(poses) * np.exp(-self.cost * steps / 6)
 
     def far_goal(self, here: Float64, otherwise: Float64) -> Float64:
-        """The pose (4, 4) that gains most a step of the way there; another if none gains enough."""
+        """The pose (4, 4) with the most gain per step; ``otherwise`` if none gains enough."""
         drawn = self.rng.integers(len(self.ways.positions), size=2 * self.goals)
         poses = views_anywhere(self.rng, self.ways.positions[drawn])
         gain = self.gain_of(poses) * self.is_new(poses, here)
@@ -247,7 +247,7 @@ class GoalPlanner(Planner):
         return poses[best] if gain[best] >= self.enough_m3 else otherwise
 
     def near_loss(self, poses: Float64) -> NDArray[np.bool_]:
-        """Which of poses (n, 4, 4) are where tracking was lost."""
+        """Which of poses (n, 4, 4) are near one where tracking was lost."""
         near = np.zeros(len(poses), dtype=bool)
         for lost in self.lost_at:
             near |= distance_in_steps(poses, lost, *self.steps).max(axis=1) <= KEPT_AWAY
@@ -255,9 +255,9 @@ class GoalPlanner(Planner):
 
     @abstractmethod
     def motion_towards(self, goal: Float64) -> int:
-        """The motion to make next, on the way to a goal (4, 4)."""
+        """The next motion towards a goal (4, 4)."""
 
 
 def _nearest(positions: Float64, position: Float64) -> int:
-    """Which of positions (N, 3) is nearest to one (3,)."""
+    """Index of the position (N, 3) nearest to another (3,)."""
     return int(np.argmin(((positions - position) ** 2).sum(axis=1)))

@@ -1,4 +1,4 @@
-"""Frontiers by the D-optimality of the pose graph, as in ExplORB-SLAM."""
+"""Choose frontiers by the D-optimality of the pose graph, as in ExplORB-SLAM."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.planning.view_goals import distance_in_steps
 
-_AWAY_M = 1.2  # from which a frontier is looked at
+_AWAY_M = 1.2  # distance from which a frontier is viewed
 _APART = 3.0  # steps between two keyframes
 _SEEN_AGAIN = 0.3  # share of a keyframe's surface in a view that makes an edge between them
-_THUMBNAIL = 12  # pixels between two points of a keyframe
+_THUMBNAIL = 12  # pixels between sampled points of a keyframe
 _START = np.diag([1e-3**2] * 6)  # of the first keyframe, for which SLAM gives no covariance
 
 
@@ -25,23 +25,24 @@ class Keyframe(NamedTuple):
     """A node of the pose graph."""
 
     T_world_camera: Float64  # (4, 4)
-    surface: Float64  # (n, 3) some of what it sees, in the world; NaN where nothing was read
+    surface: Float64  # (n, 3) sampled points in the world; NaN where there is no reading
     weight: float  # D-optimality of the information of its edges
 
 
 class GraphDOptimality(NextBestView):
     """Goes to the frontier that keeps the pose graph best connected.
 
-    Nodes are keyframes, an edge joins two that see the same surface and weighs the D-optimality of
-    its information. Of every frontier the way there is added to the graph with the edges that it
-    would have, the hallucinated loops among them, and the goal is the frontier with the largest
-    D-optimality of the whole (Placed, Gómez-Rodríguez, Tardós, Castellanos, "ExplORB-SLAM", ROBOT
-    2022; Placed, Castellanos, IROS 2021). The pose graph is the planner's own: dense SLAM has none.
-    Where there is no frontier, the goal is that of `nbv`. Motions on the way are chosen as there.
+    Nodes are keyframes. An edge joins two that see the same surface; its weight is the D-optimality
+    of its information. For every frontier, the path to it is added to the graph with its expected
+    edges, including hallucinated loop closures; the goal is the frontier with the largest
+    D-optimality of the resulting graph (Placed, Gómez-Rodríguez, Tardós, Castellanos,
+    "ExplORB-SLAM", ROBOT 2022; Placed, Castellanos, IROS 2021). The planner builds the pose graph
+    itself, as dense SLAM has none. Without a frontier, the goal is that of `nbv`. Motions on the
+    way are chosen as in `nbv`.
 
     Args:
-        robot: what it sees.
-        seed: of the goals drawn where there is no frontier.
+        robot: the robot's view.
+        seed: for drawing goals where there is no frontier.
         **options: see `NextBestView`.
 
     Raises:
@@ -49,14 +50,14 @@ class GraphDOptimality(NextBestView):
     """
 
     def reset(self) -> None:
-        """No keyframe yet."""
+        """Forget the keyframes."""
         super().reset()
         self.keyframes: list[Keyframe] = []
         self.weights = np.zeros((0, 0))
-        """(N, N) of the edge from each keyframe to each later one, 0 for none."""
+        """(N, N) weight of the edge from each keyframe to each later one, 0 for none."""
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
-        """Add a keyframe where the camera has moved on, then as `nbv` does."""
+        """Add a keyframe if the camera has moved on, then act as `nbv`."""
         here = self.robot.T_world_camera_estimate
         if info["tracking_ok"] and self.has_moved_on(here):
             self.weights = extended(self.weights, self.edges_to(here[None]))
@@ -69,7 +70,7 @@ class GraphDOptimality(NextBestView):
         return not (distance_in_steps(poses, here, *self.steps).sum(axis=1) < _APART).any()
 
     def keyframe(self, here: Float64) -> Keyframe:
-        """The last frame, taken at a pose (4, 4), as a node."""
+        """Make a node of the last frame, taken at a pose (4, 4)."""
         every = (slice(_THUMBNAIL // 2, None, _THUMBNAIL),) * 2
         depth = self.robot.last_frame.depth[every]
         read = np.where(depth > 0, depth, np.nan)
@@ -79,9 +80,9 @@ class GraphDOptimality(NextBestView):
         return Keyframe(here, transform_points(here, points), weight)
 
     def edges_to(self, way: Float64) -> Float64:
-        """Weights (N, P) of the edges from the keyframes to the poses (P, 4, 4) of a way.
+        """Weights (N, P) of the edges from the keyframes to the poses (P, 4, 4) of a path.
 
-        To its first pose there always is one from the last keyframe, of the motion.
+        An odometry edge always joins the last keyframe to the first pose.
         """
         if not self.keyframes:
             return np.zeros((0, len(way)))
@@ -93,7 +94,7 @@ class GraphDOptimality(NextBestView):
         return edges
 
     def choose_goal(self, here: Float64) -> Float64:
-        """The view (4, 4) of the frontier whose way leaves the graph best connected."""
+        """The view (4, 4) of the frontier whose path leaves the graph best connected."""
         grid = self.map.grid
         found = frontiers(grid, here[:3, 3], self.radius_m + _AWAY_M)
         goals = views_of(found, self.ways.positions, here[:3, 3], _AWAY_M)
@@ -103,7 +104,7 @@ class GraphDOptimality(NextBestView):
         return goals[np.argmax([self.connected_by(here, goal) for goal in goals])]
 
     def connected_by(self, here: Float64, goal: Float64) -> float:
-        """D-optimality of the graph with the way from ``here`` to ``goal`` (4, 4) added."""
+        """D-optimality of the graph with the path from ``here`` to ``goal`` (4, 4) added."""
         steps = distance_in_steps(goal[None], here, *self.steps).max()
         way = poses_between(here, goal, max(1, round(steps / _APART)))
         typical = float(np.median([k.weight for k in self.keyframes]))
@@ -116,7 +117,7 @@ class GraphDOptimality(NextBestView):
 
 
 def extended(weights: Float64, edges: Float64) -> Float64:
-    """Weights (N + 1, N + 1) with those of a new node's edges (N, 1) added."""
+    """Extend weights to (N + 1, N + 1) by a new node's edges (N, 1)."""
     grown = np.zeros((len(weights) + 1,) * 2)
     grown[:-1, :-1] = weights
     grown[:-1, -1:] = edges

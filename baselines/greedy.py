@@ -22,30 +22,30 @@ if TYPE_CHECKING:
 PRESETS = ("environment", "paper")
 PAPER_LOOKAHEAD = LookaheadConfig(reference="live", scale=1.0)
 PAPER_TARGETS = TargetConfig(M_I=0.19, M_D=0.25, rho_I=1.0, rho_D=1.0, depth_weight=1.0)
-"""M_I and M_D as `TargetConfig` has them, but for the paper's histograms
-(``ms-slam experiment frame_skipping --histograms paper``). The paper names no rho and no lambda: at
+"""M_I and M_D determined as for `TargetConfig`, but with the paper's histograms
+(``ms-slam experiment frame_skipping --histograms paper``). The paper gives no rho and no lambda: at
 1 "the camera moves to the locations where the image will provide maximum allowed information"."""
 
-_FLOOR_NATS = 0.002  # smaller divergences are alike
+_FLOOR_NATS = 0.002  # smaller divergences are not distinguished
 
 
 class GreedyDivergence(Planner):
     """Takes the motion whose predicted divergences come closest to their targets.
 
-    With targets of zero it stands still, as the paper says of rho = 0: no view diverges less from
-    the current one than the current one. Exploration comes from targets above zero alone.
+    With targets of zero it stands still, as the paper says of rho = 0, because no view diverges
+    less from the current one than itself. It explores only with targets above zero.
 
     Args:
-        robot: what it sees; its environment's targets are the defaults below.
-        seed: unused, the planner draws nothing at random.
+        robot: the robot's view; its environment's targets are the defaults below.
+        seed: unused; the planner is deterministic.
         preset: ``environment`` predicts, compares and aims as the environment is configured;
             ``paper`` as Algorithm 1 is printed: views of full size against the last live frame,
             256 bins of all pixels, not smoothed, and targets for this measure.
         rho_I: share of M_I to aim at, in [0, 1].
         rho_D: share of M_D to aim at, in [0, 1].
         depth_weight: lambda, significance of depth over intensity.
-        calibration: how far each motion moves the logarithm of a factor of the predictions towards
-            that of what it met over what was predicted, in [0, 1]; 0, as in the paper: not at all.
+        calibration: rate in [0, 1] at which a factor of the predictions follows the ratio of
+            measured to predicted divergence, in logarithms, per motion; 0, as in the paper: none.
 
     Raises:
         InputError: an option out of its range.
@@ -82,7 +82,7 @@ class GreedyDivergence(Planner):
         self.reset()
 
     def reset(self) -> None:
-        """Predictions are as they are until it is seen what they are worth."""
+        """Reset the factors of the predictions."""
         self.log_factor = np.zeros(2)
         self._expected: Float64 | None = None
 
@@ -90,7 +90,7 @@ class GreedyDivergence(Planner):
         """Algorithm 1; the loop over candidates, lines 3 to 8, is one batch."""
         if self.calibration and self._expected is not None and info["tracking_ok"]:
             self.learn(self._expected, info["divergence"])
-        T = np.flatnonzero(self.robot.action_masks())  # line 2: motions within reach
+        T = np.flatnonzero(self.robot.action_masks())  # line 2: possible motions
         predicted = self.predicted()[T]  # lines 1 and 3 to 8: predict and compare
         delta_I, delta_D = (predicted * np.exp(self.log_factor)).T
         i_star = np.argmin(distance_to_targets(delta_I, delta_D, self.targets))  # line 9
@@ -98,16 +98,16 @@ class GreedyDivergence(Planner):
         return int(T[i_star])  # lines 10 and 11
 
     def learn(self, predicted: Float64, met: Float64) -> None:
-        """Move the factors (2,) towards ``met`` over ``predicted`` (2,), nats."""
+        """Move the factors (2,) towards the ratio of ``met`` to ``predicted`` (2,), nats."""
         ratio = np.log((met + _FLOOR_NATS) / (predicted + _FLOOR_NATS))
         self.log_factor += self.calibration * (ratio - self.log_factor)
 
     def instead(self, action: int) -> None:
-        """What is met next is not what was predicted."""
+        """Drop the prediction, since another motion was made."""
         self._expected = None
 
     def lost_by(self, action: int) -> None:
-        """Nothing was met that could be learnt from."""
+        """Drop the prediction, since no divergence was measured."""
         self._expected = None
 
     def _predicted_as_printed(self) -> Float64:
@@ -127,7 +127,7 @@ def distance_to_targets(delta_I: Float64, delta_D: Float64, targets: TargetConfi
 
 
 def _number(value: float | str) -> float | str:
-    """Turn text from the command line into a number; what is none is for the config to refuse."""
+    """Convert text to a number; other text is returned for the config to refuse."""
     try:
         return float(value)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Next best view by motions that are held."""
+"""Next best view by repeated motions."""
 
 from __future__ import annotations
 
@@ -14,25 +14,28 @@ if TYPE_CHECKING:
     from ms_slam_env.env.robot_view import RobotView
 
 
-_CHOICE = 0.05  # of what the best motion shows: so much less, and a motion is 1/e as good a choice
+_CHOICE = (
+    0.05  # share of the best motion's volume: a motion with so much less is 1/e as good a choice
+)
 
 
 class HeldNextBestView(NextBestView):
-    """Makes the motion that shows most while it is held for some steps, and looks again.
+    """Makes the motion that would show most if repeated for some steps, then chooses again.
 
-    As MBPlanner (Dharmadhikari et al., ICRA 2020) it compares motion primitives, not poses: what
-    all views on the way show counts, each part of space once, and the sooner the more. Of those
-    that SLAM can follow, see `nbv`. Where none shows enough it goes to a goal as `nbv` does.
+    Like MBPlanner (Dharmadhikari et al., ICRA 2020) it compares motion primitives, not poses. The
+    volume shown by all views on the way counts, each part of space once, and sooner counts more.
+    Only motions that SLAM can follow are considered (see `nbv`). If none shows enough, it goes to a
+    goal as `nbv` does.
 
     Args:
-        robot: what it sees.
-        seed: of the goals drawn.
-        horizon: steps that a motion is held.
-        discount: of what one more step shows.
+        robot: the robot's view.
+        seed: for drawing goals.
+        horizon: steps for which a motion is repeated.
+        discount: factor per further step.
         least_m3: unknown volume that a motion should show, discounted.
-        enough_m3: unknown volume that a goal near by should show.
-        slip_cost: volume in m3 that a slip would cost: a motion is worth so much less times the
-            risk.
+        enough_m3: unknown volume that a nearby goal should show.
+        slip_cost: volume in m3 that a slip would cost; a motion's value is reduced by this times
+            its slip risk.
         **options: see `NextBestView`.
 
     Raises:
@@ -57,12 +60,12 @@ class HeldNextBestView(NextBestView):
         self.check({"least_m3": (0, 1000), "slip_cost": (0, 1000)})
 
     def reset(self) -> None:
-        """Nothing is known yet."""
+        """Forget the last episode."""
         super().reset()
         self.weights: Float64 | None = None
 
     def choose_motion(self, here: Float64) -> int:
-        """The admissible motion that is worth most while it is held, or the one towards a goal."""
+        """The admissible motion with the highest value, or the one towards a goal."""
         self.weights = None
         values = self.values(here)
         if not self.must_leave(here) and values.max() >= self.least_m3:
@@ -79,7 +82,7 @@ class HeldNextBestView(NextBestView):
         return super().choose_motion(here)
 
     def preferences(self) -> Float64 | None:
-        """Probabilities (n,) of the motions, by what they are worth beside the best one."""
+        """Probabilities (n,) of the motions, by their value relative to the best one."""
         return None if self.weights is None else self.weights / self.weights.sum()
 
     def values(self, here: Float64) -> Float64:

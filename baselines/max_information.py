@@ -1,4 +1,4 @@
-"""Maximum information: go where the map is emptiest."""
+"""Maximum information: look where the map is emptiest."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from ms_slam_env.env import Planner
 
 
 class MaxInformation(Planner):
-    """Takes the motion whose view is predicted to show most surface that is not mapped yet.
+    """Takes the motion whose view is predicted to show most unmapped surface.
 
-    The classical contrast to a divergence planner: next best view by expected gain, without regard
-    to whether SLAM can follow. The gain of a view is its number of pixels at which the map
-    predicts no depth: there lies surface not yet seen, or nothing within the sensor's range.
+    The classical contrast to a divergence planner: next best view by expected gain, regardless of
+    whether SLAM can follow. The gain of a view is its number of pixels for which the map predicts
+    no depth: they show surface not yet seen, or nothing within the sensor's range.
     """
 
     motions_only = True

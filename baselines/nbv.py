@@ -19,23 +19,24 @@ if TYPE_CHECKING:
 
 
 _FAR_APART_RAD = math.radians(16)
-"""Motions by more than this lead to views of which none shows what all of them show: each is then
-predicted for itself (see `ViewPredictor`), and costs as much as the first."""
-_AT_ONCE = 6  # of such motions are looked at together
+"""Larger motions lead to views without a common part: each is then predicted separately (see
+`ViewPredictor`), at the cost of the first."""
+_AT_ONCE = 6  # such motions evaluated together
 
 
 class NextBestView(GoalPlanner):
-    """Goes to where most unknown space can be seen, by motions that SLAM can follow.
+    """Goes where most unknown space can be seen, by motions that SLAM can follow.
 
-    On the way the motion is taken that comes nearest to the goal and sees something itself, among
-    those whose predicted view shows enough of the map, is not too near, and is not likely to slip.
+    On the way it takes the motion that best combines progress to the goal with gain of its own,
+    among those whose predicted view shows enough of the map, is not too near, and is unlikely to
+    make SLAM slip.
 
     Args:
-        robot: what it sees.
-        seed: of the goals drawn.
+        robot: the robot's view.
+        seed: for drawing goals.
         overlap: share of a view that the map should fill.
-        risk: probability that a frame may have to slip, see `trackability`; twice as much with
-            each goal in succession that could not be come nearer.
+        risk: slip probability permitted per frame, see `trackability`; doubled with each
+            consecutive goal that could not be approached.
         own_gain: steps that the best view on the way is worth.
         **options: of the goals, see `GoalPlanner`.
 
@@ -59,11 +60,11 @@ class NextBestView(GoalPlanner):
 
     @property
     def frames(self) -> int:
-        """Frames that a motion has: each has its part of the way, and its risk to slip."""
+        """Frames per motion; each has its share of the motion and its own slip risk."""
         return self.robot.frames_per_motion
 
     def motion_towards(self, goal: Float64) -> int:
-        """The admissible motion that comes nearest to a goal (4, 4) and gains something itself."""
+        """The admissible motion with the best progress to a goal (4, 4) and gain of its own."""
         poses = self.robot.candidate_poses()
         gain = expected_gain(self.map.grid, poses, self.robot.intrinsics, (12, 9))
         score = self.own_gain * gain / max(gain.max(), 1e-9)
@@ -79,10 +80,10 @@ class NextBestView(GoalPlanner):
     def admissible(
         self, poses: Float64, order: NDArray[np.int64] | None = None
     ) -> NDArray[np.bool_]:
-        """Which motions to poses (n, 4, 4) SLAM can follow; the possible ones if it could none.
+        """Which motions to poses (n, 4, 4) SLAM can follow; if none, all possible ones.
 
-        To stay, or but to roll, is none of them, unless there is no other. With an ``order`` (n,)
-        it is said only of the first that is, and of those before it.
+        Staying and pure roll are excluded unless nothing else is admissible. With an ``order`` (n,)
+        only the motions up to the first admissible one are tested.
         """
         possible = self.robot.action_masks()
         permitted = possible & ~self.near_loss(poses)
@@ -92,16 +93,16 @@ class NextBestView(GoalPlanner):
         for some in _in_turn(order, permitted, leads):
             risks[some] = self.risks(poses[some], permitted[some])
             if bearable(risk, risks, leads) == risk:
-                break  # what the others risk changes nothing of these
+                break  # the risks of the others do not affect these
         can = risks <= bearable(risk, risks, leads)
         moving = can & leads
         can = moving if moving.any() else can
         return can if can.any() else possible
 
     def risks(self, poses: Float64, permitted: NDArray[np.bool_]) -> Float64:
-        """Risk (n,) to slip on the motions to poses (n, 4, 4), by the views that the map predicts.
+        """Slip risk (n,) of the motions to poses (n, 4, 4), from predicted views.
 
-        Infinite where a motion is not permitted or leads to a view that SLAM cannot follow.
+        Infinite for motions that are not permitted or lead to views that SLAM cannot follow.
         """
         seen_from = np.concatenate([self.robot.T_world_camera_estimate[None], poses])
         views = self.robot.predict(seen_from, SCALE)
@@ -111,7 +112,7 @@ class NextBestView(GoalPlanner):
 def _in_turn(
     order: NDArray[np.int64] | None, permitted: NDArray[np.bool_], leads_on: NDArray[np.bool_]
 ) -> list[NDArray[np.int64]]:
-    """Which motions are looked at together: all, or a few at a time, rolls last."""
+    """Groups of motions to evaluate together: all, or a few at a time, rolls last."""
     if order is None:
         return [np.arange(len(permitted))]
     order = order[permitted[order]]

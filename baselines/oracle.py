@@ -1,4 +1,4 @@
-"""A planner that knows the scene: how soon it could be mapped, and a teacher."""
+"""A planner that knows the scene: an upper bound and a teacher."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ if TYPE_CHECKING:
     from ms_slam_env.env.robot_view import PrivilegedView
 
 
-_NEAREST_M, _FARTHEST_M = 0.3, 4.0  # of what a frame maps well
-_SLACK = 0.01  # share of its distance by which a point may lie behind what hides it
-_PLACED_M = 0.04  # error of the pose up to which a frame maps in the true place
+_NEAREST_M, _FARTHEST_M = 0.3, 4.0  # range in which a frame maps well
+_SLACK = 0.01  # share of its distance by which a visible point may lie behind the nearest surface
+_PLACED_M = 0.04  # pose error up to which a frame maps surface in its true place
 _CLEARANCE_M = 0.12
 
 
 class Oracle(PrivilegedPlanner, HeldNextBestView):
-    """`held-nbv` that reads from the scene what each motion would show of the task's surface.
+    """`held-nbv` that knows from the true scene how much of the task's surface a motion shows.
 
-    It moves by the same rules, by motions that SLAM can follow. No rival, since it sees what a
-    robot cannot: it says how much there is to gain, and an agent can learn from it what is worth
-    looking at ("privileged" teacher: Chen et al., "Learning by cheating", CoRL 2020).
+    It follows the same rules, with motions that SLAM can follow. Since it sees the true scene, it
+    is an upper bound rather than a competitor, and a teacher of where to look ("privileged"
+    teacher: Chen et al., "Learning by cheating", CoRL 2020).
 
     Args:
-        robot: what it sees, the truth included.
-        seed: of the goals drawn.
-        reference: the surface to be mapped, as a task has it: nearby, scene or arm.
-        points: of that surface that are counted.
+        robot: the robot's view, including the truth.
+        seed: for drawing goals.
+        reference: the surface to map, as in a task: nearby, scene or arm.
+        points: number of points sampled on that surface.
         least: share of them that a motion should show, discounted.
         slip_cost: share of them that a slip would cost.
         **options: see `HeldNextBestView`.
@@ -62,7 +62,7 @@ class Oracle(PrivilegedPlanner, HeldNextBestView):
         self.check({"points": (1, 1_000_000)}, "points")
 
     def reset(self) -> None:
-        """Nothing is mapped yet."""
+        """Forget the last episode."""
         super().reset()
         self.looked_at = 0
         self.left: Float32 | None = None
@@ -98,7 +98,7 @@ class Oracle(PrivilegedPlanner, HeldNextBestView):
         self.caster = RayCaster(scene.mesh.vertices, scene.mesh.faces)
 
     def _look(self) -> None:
-        """Take away what the frames since the last decision have mapped in its place."""
+        """Remove the points that the frames since the last decision have mapped in their place."""
         assert self.left is not None
         frames = self.robot.episode.frames
         for frame in frames[self.looked_at :]:

@@ -11,13 +11,13 @@ from ms_slam_env.env import Planner
 
 
 class RandomWalk(Planner):
-    """Each step takes one of the motions that are not blocked, all equally likely.
+    """Draws one of the unblocked motions in each step, all equally likely.
 
-    So it does with SLAM configurations, where the agent chooses them too.
+    Draws the SLAM configuration in the same way, where the agent chooses it.
     """
 
     def act(self, observation: Any, info: dict[str, Any]) -> Any:
-        """Draw an action uniformly from the unmasked ones, number by number if it has several."""
+        """Draw an action uniformly from the unmasked ones, each of its parts separately."""
         mask, space = self.robot.action_masks(), self.robot.action_space
         if not isinstance(space, MultiDiscrete):
             return int(self.rng.choice(np.flatnonzero(mask)))

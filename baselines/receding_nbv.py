@@ -1,4 +1,4 @@
-"""Next best view that makes one motion and looks again."""
+"""Next best view with a receding horizon: makes one motion and chooses again."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
 
 
 class RecedingNextBestView(NextBestView):
-    """`nbv` with a receding horizon: the best view is looked for anew after every motion.
+    """`nbv` with a receding horizon: searches for the best view after every motion.
 
-    As Bircher et al. (ICRA 2016) do: only the first part of the way to the best view is gone, so
-    that what it shows counts at once. Views near by are compared by `mapping.view_goals.best_goal`,
-    which draws none at random: the goal stays while nothing better is found. Where the best of them
-    gains too little it goes on as `nbv`, to far goals that it keeps.
+    As in Bircher et al. (ICRA 2016), only the first part of the path to the best view is executed,
+    so that new surface is used at once. Nearby views are compared by
+    `planning.view_goals.best_goal`, which is deterministic: the goal stays until a better one is
+    found. If the best gains too little, it continues as `nbv`, to far goals that it keeps.
 
     Args:
-        robot: what it sees.
-        seed: of the far goals drawn.
-        enough_m3: unknown volume that a goal near by should show; more, and it leaves for far goals
-            too soon.
+        robot: the robot's view.
+        seed: for drawing far goals.
+        enough_m3: unknown volume that a nearby goal should show; if it is too large, the planner
+            leaves for far goals too soon.
         **options: see `NextBestView`.
 
     Raises:
@@ -38,14 +38,14 @@ class RecedingNextBestView(NextBestView):
         super().__init__(robot, seed, enough_m3=enough_m3, **options)
 
     def reset(self) -> None:
-        """Nothing is known yet."""
+        """Forget the last episode."""
         super().reset()
         self.is_near = False
 
     goal: Float64 | None
 
     def find_goal(self, here: Float64) -> None:
-        """Take the best goal near by, straight ahead, or what `nbv` takes."""
+        """Choose the best nearby goal, reached in a straight line, or the goal of `nbv`."""
         best = best_goal(self.map.grid, here, self.robot.intrinsics, self.steps)
         is_enough = bool(self.gain_of(best[None])[0] >= self.enough_m3)
         self.is_near = not self.must_leave(here) and is_enough
@@ -55,7 +55,7 @@ class RecedingNextBestView(NextBestView):
             super().find_goal(here)
 
     def judge_goal(self, here: Float64) -> None:
-        """Drop a goal near by: the next is found from what its motion has shown."""
+        """Drop a nearby goal, so that the next choice uses the new surface."""
         if self.is_near:
             self.goal = None
         else:

@@ -1,4 +1,4 @@
-"""Standing still: the smallest trajectory error of all planners, and nothing to show for it."""
+"""Standing still: the smallest trajectory error of all planners, and no map."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from ms_slam_env.env import Planner
 class Stationary(Planner):
     """Never moves.
 
-    It belongs in every comparison because its trajectory error is the lowest of all: a measure
-    that ranks it first does not measure active SLAM.
+    Include it in every comparison: its trajectory error is the lowest of all, so a measure that
+    ranks it first does not measure active SLAM.
     """
 
     motions_only = True

@@ -1,4 +1,4 @@
-"""Next best view of several robots that share what they know and divide the unknown."""
+"""Next best view of several robots that share one map and divide the unknown space."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from ms_slam_env.env.robot_view import RobotView
 
 
-_LOOK_M = 1.5  # in front of a goal: what it is there to see
+_LOOK_M = 1.5  # distance in front of a goal of the point that it looks at
 
 
 class SharedMap:
-    """One occupancy grid of all robots, whose poses are in one frame."""
+    """One occupancy grid for all robots, with poses in a common frame."""
 
     def __init__(self, cell_m: float, reach_m: float) -> None:
         self.grid = OccupancyGrid(cell_m, reach_m)
@@ -35,18 +35,18 @@ class SharedMap:
 
 
 class TeamNextBestView(NextBestView):
-    """Next best view in the map of a team: a view gains less where a team mate is to look.
+    """Next best view in a team's map: a view gains less where a teammate's goal looks.
 
-    The expected gain of a goal is taken times 1 - max(0, 1 - d / spread) for the distance d of what
-    it looks at to what each team mate's goal looks at (Burgard, Moors, Stachniss, Schneider,
-    "Coordinated multi-robot exploration", T-RO 2005, section III-B). Not told of a team by
-    ``join`` it is `NextBestView` in a map without submaps.
+    The expected gain of a goal is multiplied by 1 - max(0, 1 - d / spread) for each teammate, d the
+    distance between the points that the two goals look at (Burgard, Moors, Stachniss, Schneider,
+    "Coordinated multi-robot exploration", T-RO 2005, section III-B). Without a call of ``join`` it
+    is `NextBestView` in a map without submaps.
 
     Args:
-        robot: what it sees.
-        seed: of the goals drawn.
-        spread_m: d at which a team mate's goal takes nothing away; 0: the robots share their map
-            but do not divide it.
+        robot: the robot's view.
+        seed: for drawing goals.
+        spread_m: distance d from which a teammate's goal has no effect; 0: the robots share their
+            map but do not divide it.
         **options: of `NextBestView`.
 
     Raises:
@@ -64,22 +64,22 @@ class TeamNextBestView(NextBestView):
         check_range(self, "spread_m", 0, 1000)
 
     def reset(self) -> None:
-        """Nothing is known yet, nobody is there."""
+        """Forget the last episode and the team."""
         super().reset()
         self.map = SharedMap(self.cell_m, self.reach_m)
         self.mates = []
 
     def join(self, team: Sequence[TeamNextBestView]) -> None:
-        """Share the map with ``team``, itself among it; called after every ``reset``."""
+        """Share the map with ``team``, which includes this planner; call after every ``reset``."""
         self.mates = [mate for mate in team if mate is not self]
         self.map = team[0].map
 
     def gain_of(self, poses: Float64) -> Float64:
-        """Expected gain (N,) of poses (N, 4, 4), m^3, that the team mates leave."""
+        """Expected gain (N,) of poses (N, 4, 4), m^3, that the teammates leave."""
         return super().gain_of(poses) * self.left_over(poses)
 
     def left_over(self, goals: Float64) -> Float64:
-        """Share (N,) of the gain of goals (N, 4, 4) that the team mates' goals leave."""
+        """Share (N,) of the gain of goals (N, 4, 4) that the teammates' goals leave."""
         share = np.ones(len(goals))
         taken = [mate.goal for mate in self.mates if mate.goal is not None]
         if self.spread_m > 0:
@@ -90,5 +90,5 @@ class TeamNextBestView(NextBestView):
 
 
 def looked_at(poses: Float64) -> Float64:
-    """Points (N, 3) in front of poses (N, 4, 4)."""
+    """Points (N, 3) that poses (N, 4, 4) look at."""
     return poses[:, :3, 3] + _LOOK_M * poses[:, :3, 2]

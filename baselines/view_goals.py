@@ -1,4 +1,4 @@
-"""Poses to go to."""
+"""Candidate goal poses: random views, poses on a line, and frontiers."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _PITCH_RAD = 0.7
 
 
 def views_anywhere(rng: np.random.Generator, positions: Float64) -> Float64:
-    """Upright poses (N, 4, 4) at positions (N, 3), looking anywhere but straight up or down."""
+    """Upright poses (N, 4, 4) at positions (N, 3) in random directions, not straight up or down."""
     yaw = rng.uniform(-np.pi, np.pi, len(positions))
     pitch = rng.uniform(-_PITCH_RAD, _PITCH_RAD, len(positions))
     return upright_poses(positions, yaw, pitch)
 
 
 def poses_between(start: Float64, end: Float64, number: int) -> Float64:
-    """``number`` poses (number, 4, 4) on the straight way to ``end`` (4, 4), the end the last."""
+    """Poses (number, 4, 4) on the straight path from ``start`` to ``end`` (4, 4), ``end`` last."""
     turn = so3_log(start[:3, :3].T @ end[:3, :3])
     shares = np.arange(1, number + 1) / number
     places = start[:3, 3] + shares[:, None] * (end[:3, 3] - start[:3, 3])
@@ -30,10 +30,10 @@ def poses_between(start: Float64, end: Float64, number: int) -> Float64:
 
 
 def frontiers(grid: OccupancyGrid, position: Float64, radius_m: float, least: int = 10) -> Float64:
-    """Middles (K, 3), metres, of the frontiers near a position (3,), the largest first.
+    """Centres (K, 3), metres, of the frontiers near a position (3,), the largest first.
 
-    Frontier cells are free and have an unknown neighbour (Yamauchi, CIRA 1997); those that touch,
-    ``least`` at the least, are one frontier.
+    Frontier cells are free and have an unknown neighbour (Yamauchi, CIRA 1997). A frontier is a
+    connected set of at least ``least`` of them.
     """
     here, reach = grid.cells_of(position), int(radius_m / grid.cell_m)
     low = np.clip(here - reach, 0, grid.log_odds.shape)
@@ -51,10 +51,10 @@ def frontiers(grid: OccupancyGrid, position: Float64, radius_m: float, least: in
 
 
 def views_of(targets: Float64, free: Float64, here: Float64, away_m: float) -> Float64:
-    """A pose (K, 4, 4) that looks at each target (K, 3) from a position of ``free`` (M, 3).
+    """Poses (K, 4, 4) that look at targets (K, 3) from positions in ``free`` (M, 3).
 
-    About ``away_m`` from the target, rather a near one than a far one from ``here`` (3,); none that
-    looks straight up or down.
+    Positions about ``away_m`` from the target and near ``here`` (3,) are preferred; views straight
+    up or down are excluded.
     """
     poses = []
     for target in targets:

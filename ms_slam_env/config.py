@@ -1,4 +1,4 @@
-"""Frozen-dataclass configuration: from nested mappings or texts, misspelt keys refused."""
+"""Build frozen-dataclass configurations from nested mappings or text; refuse misspelt keys."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ _SHOWN = 80  # characters of a bad value in a message
 
 
 def bounded(default: T, low: float, high: float) -> T:
-    """A field of a :class:`Checked` dataclass: numbers in [low, high], by default ``default``.
+    """Declare a field of a :class:`Checked` dataclass that takes numbers in [low, high].
 
-    A field declared ``int`` takes no fractions; one that may be None is only checked otherwise.
+    A field declared ``int`` takes no fractions; None passes where the field permits it.
     """
     return dataclasses.field(default=default, metadata={_RANGE: (low, high)})
 
 
 def chosen(default: T, *choices: T) -> T:
-    """A field of a :class:`Checked` dataclass: one of ``choices``, by default ``default``."""
+    """Declare a field of a :class:`Checked` dataclass that takes one of ``choices``."""
     return dataclasses.field(default=default, metadata={_CHOICES: choices})
 
 
 class Checked:
-    """A dataclass that refuses values outside what its fields state.
+    """A dataclass that refuses values its fields do not permit.
 
-    A subclass with conditions of its own calls ``super().__post_init__()`` before it checks them.
+    A subclass with further conditions calls ``super().__post_init__()`` before it checks them.
     """
 
     def __post_init__(self) -> None:
-        """Refuse values outside what :func:`bounded` and :func:`chosen` say, and false booleans.
+        """Check values against :func:`bounded` and :func:`chosen`, and that booleans are booleans.
 
         Raises:
             InputError: naming class, field, value, and the permitted range or choices.
@@ -59,18 +59,18 @@ class Checked:
 
 
 def _limits(cls: type, name: str) -> Mapping[Any, Any]:
-    """What a field states of its range or choices; one that only changes a default inherits it."""
+    """Range or choices of a field; an override that changes only the default inherits them."""
     stated = (getattr(base, "__dataclass_fields__", {}).get(name) for base in cls.__mro__)
     return next((field.metadata for field in stated if field and field.metadata), {})
 
 
 class Named(ABC):
-    """A dataclass of which some values have a name that can stand for them."""
+    """A dataclass with named presets; a preset's name can be given in place of a value."""
 
     @classmethod
     @abstractmethod
     def named(cls) -> Mapping[str, Named]:
-        """The values by name."""
+        """The presets by name."""
 
 
 class Family:
@@ -80,7 +80,7 @@ class Family:
 
     @classmethod
     def variants(cls) -> dict[str, type]:
-        """The dataclasses by name, of the modules that have been imported."""
+        """The variants by name; only those in modules already imported."""
         found: dict[str, type] = {}
         for variant in cls.__subclasses__():
             is_abstract = inspect.isabstract(variant)
@@ -92,16 +92,16 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     """Build dataclass ``cls`` from a nested mapping.
 
     Args:
-        cls: a dataclass; fields that are themselves dataclasses take nested mappings. Of a
-            :class:`Family` the variant that ``name`` names.
+        cls: a dataclass; fields that are themselves dataclasses take nested mappings. For a
+            :class:`Family`, key ``name`` selects the variant.
         values: field name to value; missing fields keep their default, a :class:`Named` or
             :class:`Family` field may be given by name, a path as text. ``{"a.b": 1}`` is
             ``{"a": {"b": 1}}``.
         path: dotted prefix used in error messages.
 
     Raises:
-        InputError: an unknown key at any depth (the message lists the valid ones), or a value
-            that the dataclass itself refuses or that is not a mapping where one belongs.
+        InputError: an unknown key at any depth (the message lists the valid ones), a value that
+            the dataclass refuses, or a value that should be a mapping and is not.
     """
     if issubclass(cls, Family) and inspect.isabstract(cls):
         cls, values = _variant(cls, values, path)
@@ -109,7 +109,7 @@ def from_dict(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     fixed = {name: field.default for name, field in fields.items() if not field.init}
     fields = {name: field for name, field in fields.items() if field.init}
-    # asdict writes those too, the name of a variant for example.
+    # asdict also writes fixed fields, such as the name of a variant.
     values = {key: v for key, v in values.items() if key not in fixed or v != fixed[key]}
     hints = get_type_hints(cls)
     arguments: dict[str, Any] = {}
@@ -145,7 +145,7 @@ def _is_needed(field: dataclasses.Field[Any]) -> bool:
 
 
 def _nested(values: Mapping[str, Any], path: str) -> Mapping[str, Any]:
-    """``values`` with a mapping in the place of dotted names."""
+    """``values`` with dotted names expanded into nested mappings."""
     if not any(isinstance(key, str) and "." in key for key in values):
         return values
     nested: dict[str, Any] = {}
@@ -161,12 +161,12 @@ def _nested(values: Mapping[str, Any], path: str) -> Mapping[str, Any]:
 
 
 def is_options(value: object) -> TypeGuard[Mapping[str, Any]]:
-    """Whether ``value`` can stand for options: a mapping of names to anything."""
+    """Whether ``value`` is a mapping whose keys can be option names."""
     return isinstance(value, Mapping) and all(isinstance(key, str) for key in value)
 
 
 def _names(hint: type) -> Mapping[str, Any]:
-    """What may stand for a value of dataclass ``hint``, by name."""
+    """The names accepted in place of a value of dataclass ``hint``, and what they stand for."""
     if issubclass(hint, Named):
         return hint.named()
     return hint.variants() if issubclass(hint, Family) else {}
@@ -175,7 +175,7 @@ def _names(hint: type) -> Mapping[str, Any]:
 def _variant(
     family: type[Any], values: Mapping[str, Any], path: str
 ) -> tuple[type[Any], dict[str, Any]]:
-    """The variant that ``values`` name, and the values for it."""
+    """The variant that ``values`` names, and the values for it."""
     variants = family.variants()
     name = values.get("name")
     if not isinstance(name, str) or name not in variants:
@@ -211,7 +211,7 @@ def check_range(owner: object, name: str, low: float, high: float) -> None:
 
 
 def check_whole(owner: object, name: str) -> None:
-    """Refuse ``owner.name`` if it is no whole number.
+    """Refuse ``owner.name`` unless it is a whole number.
 
     Raises:
         InputError: naming the class, the field and its value.
@@ -242,7 +242,7 @@ def check_counts(owner: object, name: str, most: int, highest: int) -> None:
     """Refuse ``owner.name`` unless it is 1 to ``most`` integers in [0, highest]; make it a tuple.
 
     Raises:
-        InputError: naming the class, the field, its value, and the form that it should have.
+        InputError: naming the class, the field, its value and the expected form.
     """
     value = getattr(owner, name)
     are_counts = isinstance(value, (tuple, list)) and all(
@@ -255,7 +255,7 @@ def check_counts(owner: object, name: str, most: int, highest: int) -> None:
 
 
 def parse_value(text: str, name: str) -> Any:
-    """The YAML value of option ``name``; a tuple, (4, 5, 10), is a list.
+    """Parse the YAML value of option ``name``; a tuple such as (4, 5, 10) becomes a list.
 
     Raises:
         InputError: text that is not YAML.
@@ -276,14 +276,14 @@ _NUMBERS = {
     r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
     "bool": "true|True|TRUE|false|False|FALSE",
 }
-"""What YAML 1.2 takes for a number or a truth value (and 1_000, as Python does).
+"""Numbers and booleans as YAML 1.2 spells them (and 1_000, as in Python).
 
-PyYAML reads YAML 1.1, in which ``off`` is false, ``1:30`` is 90, ``010`` is 8 and ``1e-3`` a text.
+PyYAML reads YAML 1.1, where ``off`` is false, ``1:30`` is 90, ``010`` is 8 and ``1e-3`` is text.
 """
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML's own, but nothing may be said twice, and plain values are those of YAML 1.2."""
+    """A safe YAML loader that refuses aliases and duplicate keys; scalars follow YAML 1.2."""
 
     yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
         first: [one for one in known if one[0].rpartition(":")[2] not in _NUMBERS]
@@ -291,7 +291,7 @@ class _Loader(yaml.SafeLoader):
     }
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """Refuse aliases, with which ten lines stand for a thousand million."""
+        """Refuse aliases, with which ten lines can expand to a thousand million."""
         if self.check_event(yaml.AliasEvent):
             raise yaml.composer.ComposerError(
                 None, None, "aliases (*name) are not read", self.peek_event().start_mark
@@ -299,13 +299,13 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Refuse a key that is given twice, of which YAML silently keeps the last."""
+        """Refuse a key given twice, where PyYAML would silently keep the last."""
         seen: set[Any] = set()
         for key_node, _ in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
                 continue
             key = self.construct_object(key_node)
-            if key in seen:  # 1, 1.0 and true are one key of a dict
+            if key in seen:  # 1, 1.0 and true are the same dict key
                 raise yaml.constructor.ConstructorError(
                     None, None, f"key {key_node.value!r} is given twice", key_node.start_mark
                 )
@@ -314,7 +314,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _whole_number(loader: _Loader, node: yaml.ScalarNode) -> int:
-    """A whole number in base 10, whatever it begins with, or behind 0x or 0o."""
+    """Parse a whole number: base 10 even with leading zeros, or with prefix 0x or 0o."""
     text = node.value.replace("_", "")
     return int(text, 0 if text[:2] in ("0x", "0o") else 10)
 
@@ -328,11 +328,11 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
 
 
 def load_yaml(text: str) -> Any:
-    """What YAML ``text`` says: mappings, lists and plain values, without aliases.
+    """Parse YAML ``text``: mappings, lists and plain values, without aliases.
 
     Raises:
-        ValueError: it is no YAML, gives a key twice, is nested too deeply, or has a value that
-            cannot be: a 13th month, a number of thousands of digits; in one line.
+        ValueError: with a one-line message: the text is not YAML, gives a key twice, is nested too
+            deeply, or has an impossible value (a 13th month, a number of thousands of digits).
     """
     try:
         return yaml.load(text, _Loader)
@@ -344,8 +344,8 @@ def parse_named(text: str, kind: str) -> tuple[str, dict[str, Any]]:
     """Split ``NAME,option=value,...`` into the name and the options; values are YAML scalars.
 
     Args:
-        text: to be split.
-        kind: of thing that has this name, for the error message.
+        text: the text to split.
+        kind: what the name stands for, for the error message.
 
     Raises:
         InputError: an option without ``=``, or a value that is not YAML.
@@ -361,10 +361,10 @@ def parse_named(text: str, kind: str) -> tuple[str, dict[str, Any]]:
 
 
 def free_options(texts: Sequence[str], taken: Sequence[str]) -> dict[str, Any]:
-    """``nested_options`` of an environment, but for those that the command has options for itself.
+    """``nested_options`` for an environment; refuse names that the command sets itself.
 
     Raises:
-        InputError: as there, or one that is ``taken``.
+        InputError: as for ``nested_options``, or a name in ``taken``.
     """
     found = nested_options(texts)
     for name in found:
@@ -374,10 +374,10 @@ def free_options(texts: Sequence[str], taken: Sequence[str]) -> dict[str, Any]:
 
 
 def nested_options(texts: Sequence[str]) -> dict[str, Any]:
-    """Nested mapping from texts ``name.name=value``; values are YAML.
+    """Build a nested mapping from texts ``name.name=value``; values are YAML.
 
     Raises:
-        InputError: no ``=``, a value that is not YAML, or a name that is value and mapping.
+        InputError: no ``=``, a value that is not YAML, or a name used as both value and mapping.
     """
     result: dict[str, Any] = {}
     for text in texts:

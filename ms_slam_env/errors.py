@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-_HEAD, _TAIL = 1000, 500  # characters of a message; the choices come last
-_SHOWN = 60, 20  # of what is quoted: its beginning, its end
+_HEAD, _TAIL = 1000, 500  # characters kept of a message; the choices come last
+_SHOWN = 60, 20  # characters kept of a long quotation: at its beginning, at its end
 _LONG = re.compile(
     r"""(?<!\w)(['"])(?:(?!\1).){200,}\1(?!\w) | [\[{][^][{}]{200,}[]}] | \S{300,}""", re.VERBOSE
 )
@@ -14,9 +14,9 @@ _LONG = re.compile(
 
 
 def one_line(text: object) -> str:
-    """``text`` without line breaks, and of long quotations and words the ends alone.
+    """Put ``text`` on one line, and keep only the ends of long quotations and words.
 
-    What is quoted, from a file or an option, may have megabytes.
+    Text quoted from a file or an option may have megabytes.
     """
     line = str(text)
     if len(line) > _HEAD + _TAIL:
@@ -26,9 +26,9 @@ def one_line(text: object) -> str:
 
 
 class InputError(ValueError):
-    """A value given by the user is wrong; the message is one line fit to be shown as it is.
+    """A value given by the user is wrong; the message is one line, ready to be shown.
 
-    Line breaks in what is quoted, as of a name or an array, become spaces; see `one_line`.
+    Line breaks in quoted text, such as a name or an array, become spaces; see `one_line`.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -36,7 +36,7 @@ class InputError(ValueError):
 
 
 class InputWarning(UserWarning):
-    """Something that a user gave is taken, but hardly meant; one line, as of `InputError`."""
+    """A value is accepted but probably not intended; one line, as for `InputError`."""
 
 
 class UnreachableError(InputError):

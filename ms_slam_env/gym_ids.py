@@ -1,4 +1,4 @@
-"""The ids of the environments; registering costs no import of the environment itself."""
+"""Gymnasium ids of the environments; registering does not import the environment itself."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from ms_slam_env.tasks import OWN, env_id_of
 MAX_EPISODE_STEPS = 150
 
 FOLLOWS_STATES = WrapperSpec("FollowStates", "ms_slam_env.env.wrappers:FollowStates", {})
-"""Outermost of the registered environments: Gymnasium's own wrappers follow a loaded state."""
+"""Outermost wrapper of every id: keeps Gymnasium's own wrappers in step with a loaded state."""
 
 ADAPTIVE_ID = "MSActiveSLAM-Adaptive-v0"
-"""The agent chooses motion and SLAM configuration, by an arm unless ``embodiment`` is given."""
+"""The agent chooses motion and SLAM configuration; an arm unless ``embodiment`` is given."""
 
 _PLAIN: dict[str, dict[str, Any]] = {
     "MSActiveSLAM-v0": {"embodiment": "arm"},
@@ -42,7 +42,7 @@ _PERTURBATIONS = (
 
 
 def _perturbed() -> dict[str, dict[str, Any]]:
-    """Arguments by id."""
+    """Environment arguments by id."""
     found = {}
     for perturbation in _PERTURBATIONS:
         title = "".join(word.capitalize() for word in perturbation.split("-"))
@@ -57,13 +57,13 @@ _ARGUMENTS = {**_PLAIN, **_perturbed()}
 _TASKS = {env_id_of(name): (name, make()) for name, make in OWN.items()}
 
 ENV_IDS = tuple(_PLAIN)
-"""The environments with a camera as good as the sensor."""
+"""The environments without perturbations."""
 
 PERTURBED_ENV_IDS = tuple(name for name in _ARGUMENTS if name not in _PLAIN)
-"""The same with one imperfection; ``perturbation={...}`` of ``gym.make`` sets its strength."""
+"""The perturbed environments; ``gym.make(..., perturbation={...})`` sets the strength."""
 
 TASK_IDS = tuple(_TASKS)
-"""The tasks of the benchmark, each with its scenes, options and length."""
+"""The benchmark tasks, each with its scenes, options and episode length."""
 
 
 def register_all() -> None:
@@ -80,7 +80,7 @@ def _register(env_id: str, steps: int, arguments: dict[str, Any]) -> None:
             env_id,
             entry_point="ms_slam_env.env.make:make_env",
             max_episode_steps=steps,
-            disable_env_checker=True,  # for who writes environments; it wants a reset first
+            disable_env_checker=True,  # meant for authors of environments; demands a reset first
             additional_wrappers=(FOLLOWS_STATES,),
             kwargs=arguments,
         )

@@ -1,7 +1,7 @@
-"""Tasks by name: where the camera is, how long it has, and what there is to be mapped.
+"""Tasks by name: the scenes, the episode length, and the surface to map.
 
-Our own stand here, each with a Gymnasium id (:data:`ms_slam_env.TASK_IDS`); others are entry points
-(group ``ms_slam_env.tasks``) or ``module:function``.
+The built-in tasks each have a Gymnasium id (:data:`ms_slam_env.TASK_IDS`). Add others as entry
+points (group ``ms_slam_env.tasks``) or pass ``module:function``.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ REFERENCES = ("nearby", "scene", "arm")
 
 @dataclass(frozen=True)
 class Task(Checked):
-    """What an agent is asked to do, alike for all who are compared.
+    """What an agent is asked to do; the same for every agent compared.
 
     Attributes:
-        scenes: to explore, by name.
-        env_id: environment that it is in.
+        scenes: names of the scenes to explore.
+        env_id: Gymnasium id of the environment.
         steps: length of an episode.
-        reference: the true surface that a map should have: ``nearby``, what can be seen from within
-            a straight way of 1 m of the start; ``scene``, from wherever the camera can come to;
-            ``arm``, from wherever the arm can bring it to.
-        options: of the environment; ``slam_config`` is that of ``surfel``, for no other SLAM.
-        perturbations: of the camera's frames, name to options.
+        reference: the true surface that a map should cover: ``nearby``, visible from within a
+            straight path of 1 m of the start; ``scene``, visible from anywhere the camera can go;
+            ``arm``, visible from anywhere the arm can bring it.
+        options: environment options; ``slam_config`` applies to ``surfel`` only.
+        perturbations: camera perturbations, name to options.
     """
 
     scenes: tuple[str, ...]
@@ -50,12 +50,12 @@ def room() -> Task:
 
 
 def home() -> Task:
-    """A free camera, 600 steps in a dwelling of several rooms.
+    """A free camera, 600 steps in a home of several rooms.
 
-    A step is 30 cm and 24 degrees, in three frames: as far from frame to frame as in `room`, and
-    far enough to come through a dwelling. What was seen stays in the map: by default surfels that
-    fewer than ten frames have seen go after 200 more, which cost ``nbv`` a third of the
-    completeness. It had 1.6 million surfels after 350 steps.
+    A step is 30 cm and 24 degrees, taken in three frames: the motion from frame to frame is that of
+    `room`, and the camera gets through a home. No surfel is removed within an episode: by default
+    those seen by fewer than ten frames go after 200 more frames, which cost ``nbv`` a third of the
+    completeness. The map had 1.6 million surfels after 350 steps.
     """
     steps = {"step_m": 0.3, "step_rad": math.radians(24), "frames_per_action": 3}
     slam_config = {"max_surfels": 4_000_000, "unstable_window": 2000}
@@ -64,9 +64,9 @@ def home() -> Task:
 
 
 def arm() -> Task:
-    """The paper's robot experiment: an arm, 60 simulated seconds in front of a table-top setting.
+    """The paper's robot experiment: an arm, 60 simulated seconds in front of a table-top scene.
 
-    Lost tracking does not end it. No motion is shorter than a frame at 30 Hz.
+    Lost tracking does not end the episode. No motion is shorter than a frame at 30 Hz.
     """
     patience = {"lost_patience": 1_000_000, "away_patience": 1_000_000}
     return Task(
@@ -79,10 +79,10 @@ def arm() -> Task:
 
 
 def disturbed() -> Task:
-    """The room with somebody walking in it, motion blur and automatic exposure.
+    """The room with a person walking in it, motion blur and automatic exposure.
 
-    A step of a free camera takes 1/30 s. At 1.5 m/s a person walks 5 cm meanwhile; an exposure of
-    3 ms blurs a turn of 12 degrees over 3 pixels.
+    A step of a free camera takes 1/30 s. In that time a person at 1.5 m/s walks 5 cm, and an
+    exposure of 3 ms blurs a turn of 12 degrees over 3 pixels.
     """
     return Task(
         _ROOM,
@@ -95,17 +95,17 @@ def disturbed() -> Task:
 
 
 OWN = {"room": room, "home": home, "arm": arm, "disturbed": disturbed}
-"""Our tasks; together they are the leaderboard."""
+"""The built-in tasks; together they form the leaderboard."""
 
 TASKS = ExtensionPoint("task", "ms_slam_env.tasks", own=OWN, form="module:function")
-"""Where tasks are found: functions that return a `Task`."""
+"""Lookup of tasks by name: functions that return a `Task`."""
 
 
 def find_task(name: Any) -> Task:
-    """The task of a name; ``module:function`` or the function itself as well.
+    """Find a task by name, by ``module:function``, or from the function itself.
 
     Raises:
-        InputError: an unknown name, or something that makes no task.
+        InputError: an unknown name, or a function that does not return a `Task`.
     """
     task = TASKS.find(name)()
     if not isinstance(task, Task):
@@ -114,5 +114,5 @@ def find_task(name: Any) -> Task:
 
 
 def env_id_of(name: str) -> str:
-    """Gymnasium id of one of our tasks, as ``MSActiveSLAM-Room-v0``."""
+    """Gymnasium id of a built-in task, such as ``MSActiveSLAM-Room-v0``."""
     return f"MSActiveSLAM-{name.capitalize()}-v0"

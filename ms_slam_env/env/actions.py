@@ -1,4 +1,4 @@
-"""What an action is: a motion, or a motion and the SLAM configuration for its frames."""
+"""Actions: a motion, or a motion and the SLAM configuration for its frames."""
 
 from __future__ import annotations
 
@@ -16,35 +16,36 @@ from ms_slam_env.slam.slam_backend import SlamBackend
 
 
 class MaskedDiscrete(spaces.Discrete):
-    """``Discrete`` that samples with masks of truth values, as ``info["action_mask"]`` is."""
+    """``Discrete`` that samples with boolean masks such as ``info["action_mask"]``."""
 
     def sample(self, mask: Any = None, probability: Any = None) -> np.int64:
-        """An action, among those whose mask (n,) is true if there is one."""
+        """Sample an action; with a mask (n,), only where it is true."""
         return super().sample(_int8(mask), probability)
 
 
 class MaskedMultiDiscrete(spaces.MultiDiscrete):
-    """``MultiDiscrete`` that samples with one mask of all its parts, one after the other."""
+    """``MultiDiscrete`` that samples with one mask, the concatenation of its parts' masks."""
 
     def sample(self, mask: Any = None, probability: Any = None) -> NDArray[np.int64]:
-        """Actions, among those whose mask (n + K,), or tuple of masks, is true if there is one."""
+        """Sample an action; with a mask (n + K,) or a tuple of masks, only where it is true."""
         if isinstance(mask, np.ndarray):
             mask = tuple(np.split(mask, np.cumsum(self.nvec)[:-1]))
         return super().sample(None if mask is None else tuple(map(_int8, mask)), probability)
 
 
 def _int8(mask: Any) -> Any:
-    """A mask as Gymnasium takes it; of another type only one of truth values is meant."""
+    """Convert a boolean mask to Gymnasium's int8; masks of other types pass unchanged."""
     is_bool = isinstance(mask, np.ndarray) and mask.dtype == bool
     return mask.astype(np.int8) if is_bool else mask
 
 
 class ActionDecoder(ABC):
-    """Turns an action of the agent into a motion, and whatever else it asks for.
+    """Decodes the agent's action into a motion and, where it has one, a SLAM configuration.
 
     Attributes:
-        space: of the actions.
-        num_configurations: of SLAM, among which the action chooses; 1 where it does not.
+        space: the action space.
+        num_configurations: number of SLAM configurations to choose from; 1 where there is no
+            choice.
     """
 
     space: spaces.Space[Any]
@@ -52,7 +53,7 @@ class ActionDecoder(ABC):
 
     @abstractmethod
     def decode(self, action: Any) -> int:
-        """Do what the action asks for beside its motion; return the motion's index.
+        """Apply the action's SLAM configuration, if any; return the index of its motion.
 
         Raises:
             InputError: not an action of ``space``.
@@ -60,7 +61,7 @@ class ActionDecoder(ABC):
 
     @abstractmethod
     def masks(self, motion_masks: Bool) -> Bool:
-        """Which actions are possible, where ``motion_masks`` (n,) says which motions are."""
+        """Which actions are possible, given which motions are (``motion_masks``, (n,))."""
 
     @property
     def configuration(self) -> int:
@@ -69,7 +70,7 @@ class ActionDecoder(ABC):
 
     @property
     def configuration_cost(self) -> float | None:
-        """Its cost; None where the agent does not choose it."""
+        """Cost of the SLAM configuration; None where the agent does not choose it."""
         return None
 
 
@@ -89,7 +90,7 @@ class MotionActions(ActionDecoder):
         return int(array)
 
     def masks(self, motion_masks: Bool) -> Bool:
-        """The motions'."""
+        """The motion masks unchanged."""
         return motion_masks
 
 
@@ -98,11 +99,11 @@ class MotionAndConfigurationActions(ActionDecoder):
 
     Args:
         num_motions: n.
-        slam: takes the configuration.
-        adaptation: how; says what each configuration costs.
+        slam: the backend to configure.
+        adaptation: the configurations and their costs.
 
     Raises:
-        InputError: another adaptation than the agent's, or costs that are not given.
+        InputError: an adaptation other than the agent's, or missing costs.
     """
 
     space: spaces.MultiDiscrete
@@ -125,7 +126,7 @@ class MotionAndConfigurationActions(ActionDecoder):
         return int(array[0])
 
     def masks(self, motion_masks: Bool) -> Bool:
-        """(n + K,) the motions', then the configurations', of which each is always possible."""
+        """(n + K,) motion masks, then configuration masks, which are always true."""
         return np.concatenate([motion_masks, np.ones(len(self._costs), dtype=bool)])
 
     @property
@@ -140,7 +141,7 @@ class MotionAndConfigurationActions(ActionDecoder):
 
 
 def _as_array(action: Any) -> NDArray[Any]:
-    """An action as an array; lists of unequal lengths become one that is no action."""
+    """Convert an action to an array; ragged lists become one that is no valid action."""
     try:
         return np.asarray(action)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""The environment: plan, move, render, track, judge."""
+"""The environment: plan, move, render, track, score."""
 
 from __future__ import annotations
 
@@ -39,70 +39,71 @@ VIEWS = {
     "rgb_array": "ms_slam_env.env.rendering:draw_moment",
     "human": "ms_slam_env.env.rerun_view:EpisodeView",
 }
-"""Name of the option ``render_mode`` to what shows an episode then, imported where it is chosen."""
+"""Viewer of each ``render_mode``, imported when that mode is chosen."""
 
 
 class ActiveSlamEnv(gymnasium.Env[Any, Any]):
-    """A camera chooses its next motion while a dense RGB-D SLAM estimates where it is.
+    """An agent chooses the camera's next motion while dense RGB-D SLAM estimates its pose.
 
-    Each step the camera makes one of 49 small motions (Saeedi et al., ICRA 2017, section V-D), a
-    noisy RGB-D frame is rendered, SLAM tracks and fuses it, and the information divergence
-    between consecutive frames says how hard the motion was.
+    In each step the camera makes one of 49 small motions (Saeedi et al., ICRA 2017, section V-D), a
+    noisy RGB-D frame is rendered, and SLAM tracks and fuses it. The information divergence between
+    consecutive frames measures how hard the motion was to track.
 
     ## Action space
     ``Discrete(49)``: ``7 * translation + rotation`` with translations none, up, down, left, right,
     forward, backward and rotations none, roll right, roll left, pitch forward, pitch backward, yaw
     anticlockwise, yaw clockwise, along and about the axes of the current camera frame.
-    ``MSActiveSLAM-FixedTranslation-v0``: ``Discrete(7)``, the rotation; the camera translates along
-    a straight line by itself. A masked action does nothing.
+    ``MSActiveSLAM-FixedTranslation-v0``: ``Discrete(7)``, the rotation; the translation follows a
+    fixed straight line. A masked action does nothing.
     ``MSActiveSLAM-Adaptive-v0``: ``MultiDiscrete([49, K])``, the motion and which of K SLAM
-    configurations, from fast to robust, its frames are processed under: run-time adaptation
-    (section V-B) as a decision of the agent. Its mask has 49 + K entries, the motions' first: the
-    form that sb3-contrib's MaskablePPO takes; every configuration is always possible.
+    configurations, from fast to robust, processes its frames: run-time adaptation (section V-B)
+    decided by the agent. The mask has 49 + K entries, motions first, as sb3-contrib's MaskablePPO
+    expects; every configuration is always possible.
 
     ## Observation space
     Option ``observation``: ``features`` (vector: state, grey histogram, coarse depth, action mask),
     ``lookahead`` (features and the predicted divergences of every action), ``map`` (features and
-    the space around), ``goals``, ``held`` and ``candidates`` (state, and what the planners look at
-    of every action), ``pixels`` (a vector of state and small images) or ``rgbd`` (images and
-    state). Only what the robot itself has; see
-    :mod:`ms_slam_env.env.observations`. Where the agent chooses the SLAM configuration, also the
-    one in force, one-hot (K,): at the end of the vector, or as ``slam_configuration``.
+    the occupancy around the camera), ``goals``, ``held`` and ``candidates`` (state, and the values
+    by which the planners rank every action), ``pixels`` (a vector of state and small images) or
+    ``rgbd`` (images and state). All show only what the robot itself knows; see
+    :mod:`ms_slam_env.env.observations`. Where the agent chooses the SLAM configuration, the current
+    one is added one-hot (K,): at the end of the vector, or as ``slam_configuration``.
 
     ## Reward
     The sum of these terms (``info["reward_terms"]``), each times its weight (option ``reward``):
     ``intensity_divergence`` and ``depth_divergence``, -0.5 per M_I and M_D of distance to the
-    target, of each at most 0.4, depth times lambda (0.1); ``trajectory_error``, -10 per metre that
-    the pose error grew, at most 0.1 m either way; ``new_surface``, +1 per m2 newly mapped in its
-    true place; ``lost``, -0.5 a step; ``lost_for_good``, -10 once; ``blocked``, -0.1 a masked
-    action; where the agent chooses the SLAM configuration ``compute``, -0.1 times its cost, a
-    number (``adaptation.costs``) and not a clock's, so that two runs agree.
-    Scale: random possible motions in a living room brought -0.2 to 1.6 a step in 90 % of the
-    steps with the arm and -0.4 to 1.3 with the free camera, from -1.7 (lost) to 4.0 at the
-    extremes, and -10.8 to -11.7 at the end of an episode that was lost for good.
+    target, each distance capped at 0.4, depth times lambda (0.1); ``trajectory_error``, -10 per
+    metre of growth of the pose error, capped at 0.1 m either way; ``new_surface``, +1 per m2 newly
+    mapped in its true place; ``lost``, -0.5 per lost step; ``lost_for_good``, -10 once;
+    ``blocked``, -0.1 per masked action; where the agent chooses the SLAM configuration,
+    ``compute``, -0.1 times its cost, a fixed number (``adaptation.costs``) rather than a measured
+    time, so that runs are reproducible.
+    Scale: random possible motions in a living room earned -0.2 to 1.6 in 90 % of the steps with the
+    arm and -0.4 to 1.3 with the free camera. The extremes were -1.7 (lost) and 4.0, and -10.8 to
+    -11.7 in the last step of an episode whose tracking was never recovered.
 
     ## Start
     A free pose of the scene, drawn from the seed; SLAM starts at the true pose with one frame.
 
     ## End
-    Terminated when tracking was lost for ``lost_patience`` consecutive steps, or when for
-    ``away_patience`` steps the camera was lost or in submaps that are not joined to the first;
-    truncated by the time limit (``max_episode_steps`` of ``gym.make``, 150 by default), or when
+    Terminated when tracking was lost for ``lost_patience`` consecutive steps, or when the camera
+    was lost or in submaps not joined to the first for ``away_patience`` consecutive steps.
+    Truncated by the time limit (``max_episode_steps`` of ``gym.make``, 150 by default), or when
     ``seconds`` of simulated time have passed.
 
     ## Info
     ``T_world_camera``, ``T_world_camera_estimate`` (4, 4); ``pose_covariance`` (6, 6) of the
-    estimate, of the twist (rho, phi) in metres and radians in the camera's frame, infinite where
-    SLAM gave none (at the start, while lost, by another backend or source of the pose);
+    estimate, for the twist (rho, phi) in metres and radians in the camera frame, infinite where
+    SLAM gave none (at the start, while lost, or from a backend or pose source without one);
     ``pose_error`` m; ``ate`` running RMSE of the pose error over all frames, m, no alignment;
     ``divergence`` (2,) intensity and depth between the last frames of this step and the one
     before, nats; ``tracking_ok``; ``submap``, 0 for the first and those joined to it: in
-    another one ``tracking_ok`` is true and the pose as unsure as ``pose_covariance`` says;
-    ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2;
-    ``mapped_share`` of the surface that opens into free space, [0, 1]; ``time`` simulated seconds;
-    ``energy`` mechanical work of the motion so far, J; ``scene``, ``scene_seed``.
-    No clock: timings are in ``env.unwrapped.timings``. Where the agent chooses it:
-    ``slam_configuration``, the index in force.
+    another one ``tracking_ok`` is true and ``pose_covariance`` gives the uncertainty of the pose;
+    ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2; ``mapped_share`` of the surface
+    adjacent to free space, [0, 1]; ``time`` simulated seconds; ``energy`` mechanical work of the
+    motion so far, J; ``scene``, ``scene_seed``.
+    Wall-clock timings are in ``env.unwrapped.timings`` instead. Where the agent chooses the SLAM
+    configuration, ``slam_configuration`` is the current index.
 
     ## Arguments
     The fields of :class:`ms_slam_env.env.EnvConfig`, by keyword; nested ones as dataclass or
@@ -113,14 +114,14 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     Args:
         embodiment: ``arm`` (with physics), ``arm-kinematic``, ``free`` or ``fixed-translation``.
-        render_mode: None, ``rgb_array``, or ``human``: every step is shown in the Rerun viewer.
+        render_mode: None, ``rgb_array``, or ``human``, which shows every step in the Rerun viewer.
         agent_configures_slam: whether an action has a second part, the SLAM configuration;
-            ``adaptation`` is then ``agent``, by name or as a mapping with its options.
+            ``adaptation`` must then be ``agent``, by name or as a mapping with its options.
         **options: fields of ``EnvConfig``.
 
     Raises:
-        InputError: an unknown option or choice, a value out of range, or another ``adaptation``
-            where the agent chooses the SLAM configuration.
+        InputError: an unknown option or choice, a value out of range, or an ``adaptation`` other
+            than ``agent`` where the agent chooses the SLAM configuration.
     """
 
     metadata = {  # noqa: RUF012 -- Gymnasium declares it as an instance variable
@@ -151,7 +152,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self.timings = Timings()
 
         backend = slam_backends.make(config.slam, self.intrinsics, **config.slam_config)
-        # A step's only frame is not to be dropped unless frame management is asked for.
+        # Do not drop the only frame of a step unless frame management is asked for.
         adapted = config.adaptation.adapt(backend, drops_frames=False)
         self.slam: SlamBackend = config.frame_management.manage(adapted)
         embodiment_type = EMBODIMENTS[embodiment]
@@ -167,12 +168,12 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             config.observation, self.intrinsics, num_motions, self._actions.num_configurations
         )
         self.simulation.carves |= self._observation.needs_occupancy
-        self._episodes_left = 0  # in the scene that was drawn last
+        self._episodes_left = 0  # in the scene drawn last
         self.action_space = self._actions.space
         self.observation_space = self._observation.space
         self.on_load: Callable[[int], None] = _nothing
         self.make_view: Callable[[ActiveSlamEnv], Any] | None = None
-        """Makes what shows an episode, step by step; see `rerun_view.EpisodeView`."""
+        """Creates the viewer of an episode; see `rerun_view.EpisodeView`."""
         self._view: Any = None
 
     # -- Gymnasium ---------------------------------------------------------------------------
@@ -185,12 +186,12 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         Args:
             seed: seeds the environment's generator.
             options: ``T_world_camera`` (4, 4) to start from instead of a drawn pose; ``scene`` and
-                ``scene_seed`` in place of drawn ones, for this episode: the name of one of our
-                scenes or of this environment's. All else is as the seed has it.
+                ``scene_seed`` to use in this episode instead of drawn ones. ``scene`` names a
+                built-in scene or one of this environment. Everything else follows the seed.
 
         Raises:
-            InputError: a bad option, or a start from where there is nothing to map; the
-                environment must then be reset again before it is used.
+            InputError: a bad option, or a start from which there is nothing to map; reset again
+                before using the environment.
         """
         check_reset(seed, options, self.config.scenes)
         super().reset(seed=seed)
@@ -217,10 +218,10 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Make one motion, track the frames that it brings, judge what came of it.
+        """Make one motion, track its frames, and compute the reward.
 
         Raises:
-            InputError: no action of the action space, or no reset before.
+            InputError: the action is not in the action space, or there was no reset.
         """
         reward, lost_for_good = self._advance(action)
         if self._view is not None:
@@ -228,7 +229,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         return self._observe(), reward, lost_for_good, self._time_is_up(), self._info()
 
     def _advance(self, action: Any) -> tuple[float, bool]:
-        """Make a motion and judge it: the reward, and whether the camera is lost for good."""
+        """Make a motion; return its reward and whether tracking is lost beyond recovery."""
         episode = self.episode
         episode.action = self._actions.decode(action)
         error_before = episode.pose_error
@@ -253,7 +254,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             self._view = None
 
     def render(self) -> NDArray[np.uint8] | None:
-        """One picture that explains the moment, (480, 1120, 3) uint8; None in other modes."""
+        """One picture of the current state, (480, 1120, 3) uint8; None unless ``rgb_array``."""
         if self.render_mode != "rgb_array":
             return None
         shown = self.config.targets, self.slam, self.embodiment, self.scene
@@ -287,7 +288,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             )
 
     def _predicted(self) -> PredictedViews:
-        """What the map predicts of here and of the candidates, in units of (M_I, M_D)."""
+        """Predicted views of the current pose and the candidates, divergences / (M_I, M_D)."""
         targets, poses = self.config.targets, self.candidate_poses()
         seen_from = np.concatenate([self.episode.T_world_camera_estimate[None], poses])
         divergences = self.lookahead()
@@ -300,7 +301,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         )
 
     def _lost_share(self) -> float:
-        """How much of the patience with a lost camera is used up; 1 or more ends the episode."""
+        """Share of the patience for lost tracking used up; 1 or more ends the episode."""
         lost, away = self.episode.steps_lost, self.episode.steps_away
         if lost < away:  # in a submap, or lost after one
             return max(lost / self.config.lost_patience, away / self.config.away_patience)
@@ -321,11 +322,11 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
             info[CONFIGURATION] = self._actions.configuration
         return info
 
-    # -- What evaluation may read ------------------------------------------------------------
+    # -- For evaluation ----------------------------------------------------------------------
 
     @property
     def episode(self) -> Episode:
-        """The episode so far: trajectories and measures, which evaluation may read.
+        """The episode so far, trajectories and measures, for evaluation.
 
         Raises:
             InputError: the environment was not reset.
@@ -337,22 +338,22 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     @property
     def scene(self) -> Scene:
-        """Where it is."""
+        """The current scene."""
         return self.simulation.world.scene
 
     @property
     def sensor(self) -> RGBDSensor:
-        """The camera in the scene."""
+        """The simulated RGB-D sensor."""
         return self.simulation.world.sensor
 
     @property
     def embodiment(self) -> Embodiment:
-        """What carries the camera."""
+        """The embodiment that carries the camera."""
         return self.simulation.world.embodiment
 
     @property
     def coverage(self) -> CoverageGrid:
-        """The true surface that was mapped in its place so far."""
+        """The true surface mapped in its true place so far."""
         return self.simulation.world.coverage
 
     @property
@@ -362,25 +363,25 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """What the numbers of the observations' state vector are; see ``STATE_NAMES``."""
+        """Names of the entries of the observations' state vector; see ``STATE_NAMES``."""
         return STATE_NAMES
 
-    # -- What planners use -------------------------------------------------------------------
+    # -- For planners ------------------------------------------------------------------------
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """(n,) which actions are possible now; the name is sb3-contrib's.
+        """(n,) which actions are possible now, under the name that sb3-contrib expects.
 
-        (n + K,) where the agent chooses the SLAM configuration too.
+        (n + K,) where the agent also chooses the SLAM configuration.
         """
         _ = self.episode  # none yet: say so
         return self._actions.masks(self.simulation.action_masks())
 
     def candidate_poses(self) -> Float64:
-        """(n, 4, 4) where each motion would bring the camera, by SLAM's estimate of now."""
+        """(n, 4, 4) poses that the motions would lead to from SLAM's current estimate."""
         return self.episode.T_world_camera_estimate @ self.embodiment.candidate_motions()
 
     def predict_candidates(self) -> Views:
-        """The view of each candidate as the map predicts it."""
+        """Views from the candidate poses, predicted from the map."""
         with self.timings.stage("lookahead"):
             return self._lookahead.predict(self.slam, self.candidate_poses())
 
@@ -398,21 +399,21 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         return episode.predicted_divergences.copy()
 
     def foresee(self, actions: Iterable[Any]) -> Float64:
-        """Rewards (k,) that each of some actions would bring now; nothing has changed after it.
+        """Rewards (k,) that each of k actions would earn now; the environment is left unchanged.
 
         Raises:
-            InputError: no action of the action space, or no reset before.
+            InputError: an action is not in the action space, or there was no reset.
         """
         return np.array([sum(terms.values()) for terms in self.foresee_terms(actions)])
 
     def foresee_terms(self, actions: Iterable[Any]) -> list[dict[str, float]]:
-        """The terms of those rewards, name to weighted value, as ``info["reward_terms"]``.
+        """Reward terms of each action, name to weighted value, as in ``info["reward_terms"]``.
 
-        Each action is made and taken back, in the order given: what a simulator can tell and a
-        robot cannot. Of use to tree search and to teachers, and some 15 ms an action.
+        Simulates each action and undoes it, in the order given, which a real robot cannot do.
+        Useful for tree search and teachers; takes some 15 ms an action.
 
         Raises:
-            InputError: no action of the action space, or no reset before.
+            InputError: an action is not in the action space, or there was no reset.
         """
         if not isinstance(actions, Iterable):
             raise InputError(f"actions = {actions!r} must be several")
@@ -427,10 +428,10 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         return foreseen
 
     def perturb(self, *perturbations: Perturbation) -> None:
-        """Put perturbations on the camera, after those that it has; from the next reset on.
+        """Add perturbations after the camera's present ones; they apply from the next reset.
 
         Raises:
-            InputError: one that changes how the camera moves, which is the agent's business.
+            InputError: a perturbation that changes how the camera moves; the agent decides that.
         """
         every = (*self.camera_feed.perturbations, *perturbations)
         self.simulation.camera_feed = make_camera_feed(every)
@@ -438,32 +439,32 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     # -- State -------------------------------------------------------------------------------
 
     def save_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly (the time limit's counter excepted)."""
+        """Everything needed to resume bit-exactly, except the time limit's counter."""
         _ = self.episode  # none yet: say so
         return save_state(self.simulation, self._settings(), self.np_random)
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state that ``save_state`` of an env with the same world and robot returned.
+        """Resume from a state saved by ``save_state`` of an env with the same world and robot.
 
-        No reset is needed before. Gymnasium's own wrappers of an environment made by ``gym.make``
-        follow: the time limit counts the steps of the state's episode. The next reset draws a
-        scene, whatever ``episodes_per_scene`` is.
+        No reset is needed first. The Gymnasium wrappers that ``gym.make`` adds follow: the time
+        limit counts the steps of the state's episode. The next reset draws a scene, whatever
+        ``episodes_per_scene`` is.
 
         Raises:
-            InputError: options that shape the state differ, or it is not such a state; the
-                environment is as it was.
+            InputError: not a saved state, or options that shape the state differ; the environment
+                is left unchanged.
         """
         load_state(self.simulation, state, self._settings(), self.np_random)
         self._episodes_left = 0
         self.on_load(len(self.episode.divergences_of_steps) - 1)
 
     def _settings(self) -> dict[str, Any]:
-        """What two environments must have in common to go on from one state."""
+        """Settings that two environments must share to resume from the same state."""
         settings = self.config.of_state(self._arguments[0])
         return {**settings, "perturbations": self.camera_feed.perturbations}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Arguments and, once reset, the episode: device arrays are made anew."""
+        """Arguments and, once reset, the saved episode; device arrays are allocated again."""
         return {
             "arguments": self._arguments,
             "perturbations": self.camera_feed.perturbations,
@@ -472,7 +473,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         }
 
     def __setstate__(self, pickled: dict[str, Any]) -> None:
-        """Build the environment anew and go on from where the pickled one was."""
+        """Rebuild the environment and resume where the pickled one was."""
         *arguments, options = pickled["arguments"]
         self.__init__(*arguments, **options)  # type: ignore[misc]
         self.perturb(*pickled["perturbations"])
@@ -482,4 +483,4 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
 
 def _nothing(steps: int) -> None:
-    """What is done at a loaded state where nobody asked for more."""
+    """Default callback for a loaded state: do nothing."""

@@ -1,4 +1,4 @@
-"""Where the environment's frames come from: the sensor, as it is or with imperfections."""
+"""Source of the environment's frames: the sensor, with or without perturbations."""
 
 from __future__ import annotations
 
@@ -18,71 +18,71 @@ from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences.perturbations.perturbation import Perturbation
 from ms_slam_env.slam.shared.state_check import SEED
 
-_PERTURBED = "ms_slam_env.env.perturbed_feed:PerturbedFeed"  # where it is asked for by name
+_PERTURBED = "ms_slam_env.env.perturbed_feed:PerturbedFeed"  # imported by name
 
 
 class CameraFeed(ABC):
-    """Takes the frames of an episode.
+    """Captures the frames of an episode.
 
     Attributes:
-        perturbations: of the frames, in order.
+        perturbations: applied to the frames, in order.
     """
 
     perturbations: tuple[Perturbation, ...] = ()
     state_like: ClassVar[Mapping[str, Any]] = {"noise_seed": SEED}
-    """What ``state_check`` compares states with."""
+    """Template against which ``state_check`` checks states."""
 
     @property
     def lens(self) -> Distortion:
-        """What bends the frames that are handed on as a pinhole camera's."""
+        """Lens distortion of the frames, which are passed on as a pinhole camera's."""
         return NO_DISTORTION
 
     @property
     def has_begun(self) -> bool:
-        """Whether it took part in the episode from its start."""
+        """Whether the feed has been used since the start of the episode."""
         return True
 
     @abstractmethod
     def begin(
         self, scene: Scene, sensor: RGBDSensor, T_world_camera: Float64, noise_seed: int
     ) -> None:
-        """Start an episode in a scene, which ``sensor`` looks at, from a pose (4, 4).
+        """Start an episode in a scene, seen by ``sensor``, from a pose (4, 4).
 
         Raises:
-            InputError: an imperfection that cannot be had there.
+            InputError: a perturbation that is impossible there.
         """
 
     @abstractmethod
     def set_trajectory(self, times_s: Float64, poses: Float64) -> None:
-        """Announce the poses (k, 4, 4) of the next frames, after the present one, which is first.
+        """Announce the poses (k, 4, 4) of the next frames; the first is the present pose.
 
-        ``times_s`` (k,) since the start of the episode.
+        ``times_s`` (k,) are seconds since the start of the episode.
         """
 
     @abstractmethod
     def capture(self, T_world_camera: Float64, index: int, time_s: float) -> RGBDFrame | None:
-        """Take frame ``index`` at an announced pose (4, 4) and time; None if it is not delivered.
+        """Capture frame ``index`` at an announced pose (4, 4) and time; None if it is dropped.
 
         The first frame is always delivered.
         """
 
     @abstractmethod
     def true_depth(self) -> NDArray[np.float32]:
-        """True depth (H, W) of the last frame, metres; 0 = no surface, or one that moves."""
+        """True depth (H, W) of the last frame, metres; 0 = no surface, or a moving one."""
 
     @abstractmethod
     def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly."""
+        """Everything needed to resume bit-exactly."""
 
     def set_state(
         self, state: dict[str, Any], scene: Scene, sensor: RGBDSensor, start: Float64
     ) -> None:
-        """Go on from a state that ``get_state`` returned in an episode that began at ``start``."""
+        """Resume from a state that ``get_state`` returned in an episode begun at ``start``."""
         self.begin(scene, sensor, start, state["noise_seed"])
 
 
 class SensorFeed(CameraFeed):
-    """Every frame as the sensor takes it."""
+    """Every frame as the sensor captures it."""
 
     def begin(
         self, scene: Scene, sensor: RGBDSensor, T_world_camera: Float64, noise_seed: int
@@ -91,7 +91,7 @@ class SensorFeed(CameraFeed):
         self._sensor, self._seed = sensor, noise_seed
 
     def set_trajectory(self, times_s: Float64, poses: Float64) -> None:
-        """Nothing depends on where the camera is between the frames."""
+        """Do nothing: the frames do not depend on the camera's motion between them."""
 
     def capture(self, T_world_camera: Float64, index: int, time_s: float) -> RGBDFrame | None:
         """See the base class; every frame is delivered."""
@@ -107,10 +107,10 @@ class SensorFeed(CameraFeed):
 
 
 def make_camera_feed(perturbations: tuple[Perturbation, ...]) -> CameraFeed:
-    """Frames as the sensor takes them, with perturbations if there are any.
+    """Make the feed for a tuple of perturbations, which may be empty.
 
     Raises:
-        InputError: one that changes how the camera moves, which is the agent's business.
+        InputError: a perturbation that changes how the camera moves; the agent decides that.
     """
     if not perturbations:
         return SensorFeed()

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="empty-body"
-"""How much true surface has been mapped where it really is."""
+"""Measure how much true surface has been mapped in its true place."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from ms_slam_env.scenes.scene import Scene
 _STRIDE = 2  # every second pixel in each direction marks coverage
 
 
-_SAMPLES_A_VOXEL = 2  # along an edge: four points on each face, so that none is missed
+_SAMPLES_A_VOXEL = 2  # per edge: four points on each face, so that no voxel is missed
 
 
 @dataclass(frozen=True)
 class Voxels:
-    """The voxels of a scene; worked out once and shared.
+    """The voxels of a scene, computed once and shared.
 
     Attributes:
-        origin: (3,) lower corner of the first, metres.
-        shape: (3,) how many along each axis.
-        reachable: (number of voxels,) whether there is surface in it that opens into free space.
+        origin: (3,) lower corner of the first voxel, metres.
+        shape: (3,) number of voxels along each axis.
+        reachable: (number of voxels,) whether a voxel contains surface adjacent to free space.
     """
 
     origin: Float64
@@ -40,19 +40,19 @@ class Voxels:
 
     @cached_property
     def num_reachable(self) -> int:
-        """How many are reachable."""
+        """Number of reachable voxels."""
         return int(np.count_nonzero(self.reachable))
 
     @staticmethod
     def of(scene: Scene, voxel_m: float) -> Voxels:
-        """The voxels of a scene, with an edge in metres."""
+        """The voxels of a scene, with edges of ``voxel_m`` metres."""
         known = _VOXELS.setdefault(scene, {})
         if voxel_m not in known:
             known[voxel_m] = _voxels(scene, voxel_m)
         return known[voxel_m]
 
     def index(self, points: Float64, voxel_m: float) -> NDArray[np.int64]:
-        """Voxels of the points (N, 3) that lie in the grid."""
+        """Indices of the voxels of those points (N, 3) that lie in the grid."""
         cells = np.floor((points - self.origin) / voxel_m).astype(np.int64)
         inside = np.all((cells >= 0) & (cells < np.array(self.shape)), axis=1)
         return np.ravel_multi_index(tuple(cells[inside].T), self.shape)
@@ -90,7 +90,7 @@ def mark_points(
     mapped: wp.array[wp.uint8],
     counts: wp.array[wp.int32],
 ) -> None:
-    """Mark what ``mark_seen`` says."""
+    """Launch ``mark_seen``."""
 
 
 @wp.kernel
@@ -103,15 +103,15 @@ def mark_seen(
     mapped: wp.array[wp.uint8],  # (voxels,) in and out
     counts: wp.array[wp.int32],  # (2,) voxels mapped, and of those reachable; in and out
 ) -> None:
-    """Mark the true voxels of points that the estimate puts less than a voxel away; one thread."""
+    """Mark the true voxels of points that the estimate puts within a voxel; single-threaded."""
     mark_points(depth, rays, poses, grid, reachable, mapped, counts)
 
 
 class CoverageGrid:
     """Voxels of true surface that were mapped in their true place.
 
-    A point counts as mapped when the estimated pose puts it less than one voxel from where it is:
-    neither a camera that stands still nor one that is lost gathers more.
+    A point counts as mapped when the estimated pose puts it less than one voxel from its true
+    place. Neither a camera that stands still nor one that is lost gains more.
 
     Args:
         scene: gives the bounds.
@@ -123,7 +123,7 @@ class CoverageGrid:
         self.voxel_m = voxel_m
         self._voxels = voxels = Voxels.of(scene, voxel_m)
         self._mapped = np.zeros(len(voxels.reachable), dtype=bool)
-        self._counts = np.zeros(2, dtype=np.int32)  # mapped, and of those reachable
+        self._counts = np.zeros(2, dtype=np.int32)  # mapped voxels, and the reachable among them
         marked_rays = np.ascontiguousarray(rays[::_STRIDE, ::_STRIDE], dtype=np.float64)
         self._depth = np.zeros(marked_rays.shape[:2], dtype=np.float32)
         self._poses = np.zeros((2, 4, 4))
@@ -143,10 +143,10 @@ class CoverageGrid:
         T_world_camera: Float64,
         T_world_camera_estimate: Float64,
     ) -> float:
-        """Mark what a frame shows; return the area newly mapped in its true place, square metres.
+        """Mark the surface in a frame; return the area newly mapped in its true place, m2.
 
-        Where the sensor has a reading the true depth counts: noise in depth would spread one
-        surface over ever more voxels, and a camera at rest would be paid for it.
+        The true depth is used wherever the sensor has a reading: depth noise would spread one
+        surface over ever more voxels, and reward a camera at rest.
 
         Args:
             depth: (H, W) readings, 0 = none.
@@ -168,9 +168,9 @@ class CoverageGrid:
 
     @property
     def mapped_share(self) -> float:
-        """Share of the reachable surface that was mapped in its true place so far, [0, 1].
+        """Share of the reachable surface mapped in its true place so far, [0, 1].
 
-        Reachable is what opens into free space (``Scene.surface_points``), counted in voxels.
+        Reachable surface is adjacent to free space (``Scene.surface_points``), counted in voxels.
         """
         return int(self._counts[1]) / max(1, self._voxels.num_reachable)
 
@@ -179,19 +179,19 @@ class CoverageGrid:
         return {"mapped": np.packbits(self._mapped)}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
+        """Resume from a state that ``get_state`` returned."""
         self._mapped[:] = np.unpackbits(state["mapped"], count=self._mapped.size)
         reachable = np.count_nonzero(self._mapped & self._voxels.reachable)
         self._counts[:] = np.count_nonzero(self._mapped), reachable
 
 
 def _shared(array: NDArray[Any], dtype: Any) -> wp.array:
-    """A kernel's view of an array's own memory."""
+    """Wrap an array for a kernel without copying."""
     return wp.array(array, dtype=dtype, device="cpu", copy=False)
 
 
 def team_share(grids: Sequence[CoverageGrid]) -> float:
-    """Share of the reachable surface that one of several robots in a scene has mapped, [0, 1]."""
+    """Share of a scene's reachable surface mapped by at least one of several robots, [0, 1]."""
     voxels = grids[0]._voxels
     mapped = np.logical_or.reduce([grid._mapped != 0 for grid in grids])
     return int(np.count_nonzero(mapped & voxels.reachable)) / max(1, voxels.num_reachable)

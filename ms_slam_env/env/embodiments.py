@@ -1,4 +1,4 @@
-"""The embodiments by name, built from the environment's configuration."""
+"""Embodiments by name, built from the environment's configuration."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from ms_slam_env.scenes.scene import Scene
 
 @dataclass(frozen=True)
 class EmbodimentType:
-    """How many motions an embodiment has, and how to build it in a scene.
+    """The number of motions of an embodiment, and how to build it in a scene.
 
-    ``check`` raises an InputError if the configuration cannot be built anywhere.
+    ``check`` raises an InputError if the configuration cannot be built in any scene.
     """
 
     num_motions: int
@@ -28,7 +28,7 @@ class EmbodimentType:
 
 
 def _arm(reference: str) -> EmbodimentType:
-    """An arm, whose planning and physics are imported where there is one."""
+    """An arm; its planning and physics are imported only when one is built."""
 
     def build(scene: Scene, config: EnvConfig, timings: Timings) -> Embodiment:
         cls = load_reference(reference)
@@ -54,7 +54,7 @@ def _free(cls: type[FreeCamera] | type[FixedTranslation]) -> EmbodimentType:
 
 
 def _has_no_arm(config: EnvConfig) -> None:
-    """Refuse what only an arm has."""
+    """Refuse options that need an arm."""
     hint = "needs an arm: embodiment='arm' or 'arm-kinematic', as MSActiveSLAM-v0 has"
     if config.pose in KINEMATIC_SOURCES:
         raise InputError(f"pose={config.pose!r} {hint}; nothing holds a free camera")
@@ -68,4 +68,4 @@ EMBODIMENTS = {
     "free": _free(FreeCamera),
     "fixed-translation": _free(FixedTranslation),
 }
-"""Name of the option ``embodiment`` to type."""
+"""Embodiment type of each name of the option ``embodiment``."""

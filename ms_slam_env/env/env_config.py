@@ -1,4 +1,4 @@
-"""Configuration of the environment: one frozen dataclass a stage, composed in ``EnvConfig``."""
+"""Configuration of the environment: one frozen dataclass per stage, composed in ``EnvConfig``."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from ms_slam_env.slam.configuration import is_file_name, read_configuration
 from ms_slam_env.slam.frame_selection import EveryFrameConfig, FrameSelectionConfig
 
 OTHER_OPTIONS = ("embodiment", "render_mode", "task", "max_episode_steps")
-"""Options of ``gym.make`` beside the fields of ``EnvConfig``; the last is Gymnasium's own."""
+"""Options of ``gym.make`` that are not fields of ``EnvConfig``; the last is Gymnasium's own."""
 
 MAP = "map"
-"""Of the option ``mask``: by what the robot knows."""
+"""Value of the option ``mask``: masks from the robot's own map."""
 
 _OF_STATE = (
     "image_size",
@@ -71,61 +71,61 @@ class LookaheadConfig(Checked):
 
 @dataclass(frozen=True)
 class EnvConfig(Checked):
-    """Everything about an environment but its id.
+    """All options of an environment except its id.
 
     Attributes:
-        scene: a scene's name, a mesh file, or several to draw from at each reset.
+        scene: a scene name, a mesh file, or several to draw from at each reset.
         scene_seed: one seed, or None to draw from ``split`` at each reset.
-        split: which seeds to draw from: train, validation or test; or your own, as 7000-7003 or
-            7000,7005.
-        num_scene_seeds: how many seeds of the split are used, as many as the agents that are
-            shipped were trained with: four rooms alone are learnt by heart. To build a room takes
-            a second, a home longer; the last 20 rooms or five homes are kept.
-        episodes_per_scene: episodes in a row in a scene that was drawn; one that is reset with a
-            seed draws in any case.
+        split: which seeds to draw from: train, validation or test, or seeds of your choice, such
+            as 7000-7003 or 7000,7005.
+        num_scene_seeds: how many seeds of the split are used. The shipped agents were trained with
+            the default; with only four rooms an agent memorizes them. Building a room takes a
+            second, a home longer; the last 20 rooms or five homes are cached.
+        episodes_per_scene: consecutive episodes in a drawn scene; a reset with a seed always draws
+            again.
         image_size: of the camera, WIDTHxHEIGHT pixels.
-        field_of_view_deg: of the camera, from left to right; None for that of the Xtion, 58.6.
-        noise: sensor noise: ``kinect``, ``range`` or ``none``; a mapping with the ``name`` of one,
-            a ``strength`` (1 as it is, 0 off) and fields of ``ms_slam_env.sensor.NoiseConfig``.
-        arm: the arm, where the embodiment is one.
-        pose: where the estimated pose comes from: ``slam``, ``slam-kinematics`` (SLAM that starts
-            its search from the arm's forward kinematics), ``kinematics`` (noisy forward kinematics
-            alone; SLAM only maps) or ``ground_truth``. Kinematics need an arm.
-        slam: SLAM backend, ``module:Class`` or a class; options appended as in
-            ``surfel,check_slips=true,refuse_open=true``, which suits motions as large as a step,
-            are put before those of ``slam_config``.
-        adaptation: how the running SLAM changes its configuration: ``none``, ``divergence`` or, as
-            ``MSActiveSLAM-Adaptive-v0`` has it, ``agent``; a mapping with the ``name`` of one for
-            options. Every frame is processed, whatever ``keep_every`` of a configuration says.
+        field_of_view_deg: horizontal field of view of the camera; None for the Xtion's, 58.6.
+        noise: sensor noise: ``kinect``, ``range`` or ``none``; or a mapping with such a ``name``, a
+            ``strength`` (1 unchanged, 0 off) and fields of ``ms_slam_env.sensor.NoiseConfig``.
+        arm: options of the arm, for embodiments that have one.
+        pose: source of the estimated pose: ``slam``, ``slam-kinematics`` (SLAM initialized from the
+            arm's forward kinematics), ``kinematics`` (noisy forward kinematics alone; SLAM only
+            maps) or ``ground_truth``. Kinematics need an arm.
+        slam: SLAM backend: a name, ``module:Class`` or a class. Options may be appended, as in
+            ``surfel,check_slips=true,refuse_open=true``, which suits motions as large as a step;
+            those of ``slam_config`` override them.
+        adaptation: how SLAM changes its configuration at run time: ``none``, ``divergence`` or
+            ``agent`` (as in ``MSActiveSLAM-Adaptive-v0``); or a mapping with such a ``name`` and
+            its options. Every frame is processed, whatever a configuration's ``keep_every``.
         frame_management: which frames SLAM processes: ``none`` (every frame), ``regular``,
-            ``divergence`` or ``budget``; a mapping with the ``name`` of one for options. The pose
-            of a dropped frame is predicted, its surface is not mapped.
-        slam_config: options of the backend, or a configuration file (YAML), which also says what
-            ``slam`` is and what ``image_size`` is where that is not given.
+            ``divergence`` or ``budget``; or a mapping with such a ``name`` and its options. The
+            pose of a dropped frame is predicted; its surface is not mapped.
+        slam_config: options of the backend, or a configuration file (YAML), which also sets
+            ``slam``, and ``image_size`` where that is not given.
         observation: ``rgbd``, ``pixels``, ``features``, ``lookahead``, ``map``, ``goals``,
             ``held``, ``candidates``, ``module:Class`` or a class.
         step_m: translation of a motion, metres.
         step_rad: rotation of a motion, radians.
-        frames_per_action: frames that a camera which nothing holds takes on a motion, at 30 Hz; an
-            arm takes those of the time that it needs.
-        lost_patience: steps that tracking may stay lost before the episode ends.
-        away_patience: steps that the camera may be in submaps that are not joined to the first
-            before it ends, lost or not: where it started is known no longer. For SLAM that starts
-            no submaps, ``lost_patience`` decides.
-        mask: how ``action_masks`` knows which motions are possible: ``true`` casts them in the true
-            scene from the true pose, ``map`` in the occupancy grid of the robot's own map from the
-            estimated pose. There what was not seen is permitted; a motion that then meets
-            something is not made, as a masked one, and its end is taken for occupied.
-        seconds: simulated time after which an episode is truncated; None for the steps alone.
+        frames_per_action: frames that a free camera takes per motion, at 30 Hz; an arm takes as
+            many as fit in the time it needs.
+        lost_patience: consecutive steps that tracking may stay lost before the episode ends.
+        away_patience: consecutive steps that the camera may be lost or in submaps not joined to the
+            first before the episode ends: its pose relative to the start is then unknown. For SLAM
+            without submaps, ``lost_patience`` decides.
+        mask: how ``action_masks`` decides which motions are possible: ``true`` tests them in the
+            true scene from the true pose, ``map`` in the occupancy grid of the robot's own map from
+            the estimated pose, where unseen space is permitted. A motion that then collides is not
+            made, like a masked one, and its end is marked occupied.
+        seconds: simulated time after which an episode is truncated; None for no such limit.
         divergence: how divergence is measured.
-        frame_divergences: whether the divergence of every frame from the one before is measured,
-            which evaluation may read; without, only that of each step's last frame, which is what
-            ``info`` and the reward are about: nine of ten measurements less with the arm.
+        frame_divergences: whether to measure the divergence of every frame from the one before,
+            for evaluation. If false, only that of each step's last frame is measured, which
+            ``info`` and the reward use: with the arm, nine out of ten measurements fewer.
         lookahead: how candidates are predicted.
         targets: motion-and-structure parameters and thresholds.
-        reward: weights of the reward terms, or ``paper`` for the paper's; or a function of a step's
-            ``Outcome``, or its name ``module:function``, that returns a number, or terms by name
-            whose sum is the reward.
+        reward: weights of the reward terms, or ``paper`` for the paper's. Or a function, or its
+            name ``module:function``, of a step's ``Outcome`` that returns a number, or terms by
+            name whose sum is the reward.
     """
 
     scene: SceneName | tuple[SceneName, ...] = "living_room"
@@ -158,7 +158,7 @@ class EnvConfig(Checked):
 
     def __post_init__(self) -> None:
         """Refuse unknown choices and values out of range."""
-        if self.mask is True:  # what YAML makes of the name
+        if self.mask is True:  # YAML reads the name as a boolean
             object.__setattr__(self, "mask", "true")
         super().__post_init__()
         _ = self.camera  # refuses a bad size
@@ -205,9 +205,9 @@ class EnvConfig(Checked):
     def draw_scene(
         self, rng: np.random.Generator, given: Mapping[str, Any] | None = None
     ) -> tuple[SceneName, int]:
-        """Name and seed of an episode's scene, where ``given`` options of a reset do not say them.
+        """Name and seed of an episode's scene; ``given`` options of a reset override drawn ones.
 
-        They are drawn in any case: what is drawn after them does not depend on what is given.
+        They are always drawn, so that later draws do not depend on ``given``.
         """
         name = self.scenes[int(rng.integers(len(self.scenes)))]
         seed = self.scene_seed
@@ -221,12 +221,12 @@ class EnvConfig(Checked):
         return name, seed if given.get("scene_seed") is None else int(given["scene_seed"])
 
     def of_state(self, embodiment: str) -> dict[str, Any]:
-        """What two environments must have in common to go on from one state."""
+        """Settings that two environments must share to resume from the same state."""
         return {"embodiment": embodiment, **{name: getattr(self, name) for name in _OF_STATE}}
 
 
 REWARDS = ExtensionPoint("reward", "ms_slam_env.rewards", form="module:function")
-"""Where functions of a step's ``Outcome`` are found."""
+"""Lookup of reward functions of a step's ``Outcome``."""
 
 
 def _reward(given: object) -> RewardConfig | Callable[..., Any]:
@@ -258,8 +258,8 @@ def make_config(
 
     Args:
         options: fields of :class:`EnvConfig`; nested ones as dataclass or mapping.
-        others: options that are valid beside them, for the error message.
-        taken: fields that are not to be named there.
+        others: further valid options to list in the error message.
+        taken: fields to leave out of that list.
 
     Raises:
         InputError: an unknown option (the message lists the valid ones), a bad value, or a bad
@@ -274,7 +274,7 @@ def make_config(
 
 
 def _read_slam_config(options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """``options`` with what a file given as ``slam_config`` holds in its place."""
+    """Replace a file given as ``slam_config`` with its contents."""
     given = options.get("slam_config")
     if given is None or not is_file_name(given):
         return options
@@ -289,11 +289,11 @@ RESET_OPTIONS = ("T_world_camera", "scene", "scene_seed")
 
 
 def check_reset(seed: Any, options: Any, own: Sequence[SceneName]) -> None:
-    """Refuse arguments of ``reset`` of an environment whose scenes are ``own``.
+    """Check the arguments of ``reset`` of an environment whose scenes are ``own``.
 
     Raises:
-        InputError: one of the wrong type, an unknown option, or a scene that is none of ours and
-            none of the environment's.
+        InputError: a wrong type, an unknown option, or a scene that is neither built in nor one of
+            ``own``.
     """
     if seed is not None and not _is_seed(seed):
         raise InputError(f"reset(seed={seed!r}): must be an integer >= 0 or None")

@@ -1,4 +1,4 @@
-"""What an episode consists of so far."""
+"""Record of an episode so far: frames, trajectories and measures."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ from ms_slam_env.slam.slam_backend import TrackResult
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """What is kept of a frame.
+    """Record of one frame.
 
     Attributes:
-        T_world_camera: (4, 4) the truth.
-        T_world_camera_kinematic: (4, 4) by forward kinematics, tied to the truth at the start.
-        T_world_camera_estimate: (4, 4) as estimated when it was current.
+        T_world_camera: (4, 4) true pose.
+        T_world_camera_kinematic: (4, 4) pose from forward kinematics, equal to the truth at the
+            start.
+        T_world_camera_estimate: (4, 4) pose estimated when the frame was current.
         tracking_ok: whether tracking held.
-        processed: whether SLAM has seen it.
-        submap: that it is in, 0 for the first and those joined to it by then.
+        processed: whether SLAM processed the frame.
+        submap: index of the frame's submap, 0 for the first and those joined to it by then.
         time_s: simulated seconds since the start.
-        divergence: (2,) from the frame before, nats; -1 where that was not measured.
+        divergence: (2,) from the frame before, nats; -1 where it was not measured.
         pose_error: distance between the true and the estimated position, metres.
     """
 
@@ -53,26 +54,26 @@ _GROWING = ("frames", "divergences_of_steps", "reward_terms")
 class Episode:
     """Trajectories, last frame and running measures of an episode of N frames in S steps.
 
-    One step brings one frame or several; its divergence compares its last frame with the last one
-    of the step before.
+    A step has one or more frames; its divergence compares its last frame with the last one of the
+    step before.
 
     Attributes:
-        scene, scene_seed: where it takes place.
-        noise_seed: of the sensor.
+        scene, scene_seed: where the episode takes place.
+        noise_seed: seed of the sensor noise.
         energy_j: mechanical work of the motion so far.
         action: index of the last motion; 0 before the first.
-        steps_lost: consecutive steps that tracking has been lost.
-        steps_away: consecutive steps that the camera has not been tracked in the first submap or
-            one joined to it.
-        tracking_ok, inlier_fraction: SLAM's word on the last frame.
-        frames: (N) everything that is kept of each.
-        divergences_of_steps: (S + 1) of the start, zero, and of each step, (2,) nats.
+        steps_lost: consecutive steps for which tracking has been lost.
+        steps_away: consecutive steps in which the camera has not been tracked in the first submap
+            or one joined to it.
+        tracking_ok, inlier_fraction: reported by SLAM for the last frame.
+        frames: (N) records of the frames.
+        divergences_of_steps: (S + 1) zero for the start, then one for each step, (2,) nats.
         reward_terms: of the last step, name to weighted value.
         histograms, step_histograms: of the last frame, and of the last one of the step before.
         frame: the last live frame.
-        pose_covariance: (6, 6) of the last estimated pose, as ``TrackResult`` has it; None where
-            none was estimated: at the start, while lost, or by who does not know it.
-        predicted_divergences: (n, 2) of the candidates, once they have been asked for.
+        pose_covariance: (6, 6) of the last estimated pose, as in ``TrackResult``; None where none
+            was estimated: at the start, while lost, or with a pose source that gives none.
+        predicted_divergences: (n, 2) of the candidates, once they have been requested.
         occupancy: carved from the last frame of each step, where the observation needs it.
     """
 
@@ -101,7 +102,7 @@ class Episode:
     def observe(
         self, frame: RGBDFrame | None, T_true: Float64, T_kinematic: Float64, time_s: float
     ) -> FrameObservation:
-        """What is known of a moment; where no frame was delivered the last one is still there."""
+        """Observe one moment; if no frame was delivered, the last one stays."""
         before = self._last_known()
         T_last_kinematic = before.T_world_camera_kinematic if before else T_kinematic
         return FrameObservation(
@@ -113,12 +114,12 @@ class Episode:
         )
 
     def _last_known(self) -> FrameRecord | None:
-        """The last frame that was tracked, from which motion is counted on; else the last."""
+        """The last tracked frame, from which motion accumulates; if there is none, the last."""
         tracked = (frame for frame in reversed(self.frames) if frame.tracking_ok)
         return next(tracked, self.frames[-1] if self.frames else None)
 
     def record(self, seen: FrameObservation, result: TrackResult, divergence: Float64) -> None:
-        """Append what one frame brought; ``divergence`` (2,) is from the frame before."""
+        """Append the record of one frame; ``divergence`` (2,) is from the frame before."""
         off = result.T_world_camera[:3, 3] - seen.T_world_camera[:3, 3]
         made = FrameRecord(
             T_world_camera=seen.T_world_camera.copy(),
@@ -152,7 +153,7 @@ class Episode:
         self.steps_away = 0 if is_anchored else self.steps_away + 1
 
     def copy(self) -> Episode:
-        """An independent copy; what was recorded never changes and is shared."""
+        """An independent copy; recorded frames never change and are shared."""
         own = {name: copy.copy(getattr(self, name)) for name in _GROWING}
         occupancy = None if self.occupancy is None else self.occupancy.copy()
         return replace(self, occupancy=occupancy, **own)
@@ -162,7 +163,7 @@ class Episode:
     @property
     def last_frame(self) -> RGBDFrame:
         """The last live frame."""
-        assert self.frame is not None  # reset records a frame before anyone can ask
+        assert self.frame is not None  # reset has recorded one
         return self.frame
 
     @property
@@ -191,7 +192,7 @@ class Episode:
         return self.divergences_of_steps[-1]
 
     def info(self) -> dict[str, Any]:
-        """What ``info`` says of the episode itself; the arrays are copies."""
+        """The episode's entries of ``info``; the arrays are copies."""
         return {
             "T_world_camera": self.frames[-1].T_world_camera.copy(),
             "T_world_camera_estimate": self.T_world_camera_estimate.copy(),
@@ -226,22 +227,22 @@ class Episode:
 
     @property
     def trajectory_kinematics(self) -> Float64:
-        """(N, 4, 4) poses by forward kinematics, tied to the truth at the first."""
+        """(N, 4, 4) poses from forward kinematics, equal to the truth at the first frame."""
         return np.stack([frame.T_world_camera_kinematic for frame in self.frames])
 
     @property
     def tracked(self) -> NDArray[np.bool_]:
-        """(N,) whether tracking held at each frame; one that was processed is part of the map."""
+        """(N,) whether tracking held at each frame; those also processed are part of the map."""
         return np.array([frame.tracking_ok for frame in self.frames])
 
     @property
     def processed(self) -> NDArray[np.bool_]:
-        """(N,) whether SLAM has seen each frame; frame selection drops the others."""
+        """(N,) whether SLAM processed each frame; frame selection drops the others."""
         return np.array([frame.processed for frame in self.frames])
 
     @property
     def timestamps(self) -> Float64:
-        """(N,) simulated seconds since the start of the episode, of each frame."""
+        """(N,) simulated seconds from the start of the episode to each frame."""
         return np.array([frame.time_s for frame in self.frames])
 
     @property
@@ -249,7 +250,7 @@ class Episode:
         """(N, 2) divergence of each frame from the one before; zero for the first.
 
         Raises:
-            InputError: they were not measured.
+            InputError: the divergences were not measured.
         """
         measured = np.stack([frame.divergence for frame in self.frames])
         if (measured < 0).any():
@@ -258,7 +259,7 @@ class Episode:
 
     @property
     def step_divergences(self) -> Float64:
-        """(S + 1, 2) ``info["divergence"]`` of the start and of each step."""
+        """(S + 1, 2) ``info["divergence"]`` at the start and after each step."""
         return np.stack(self.divergences_of_steps)
 
     @property

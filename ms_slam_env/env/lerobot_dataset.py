@@ -1,8 +1,8 @@
-"""Episodes as a LeRobotDataset of format v3.0: Parquet, JSON and PNG, without LeRobot itself.
+"""Write episodes as a LeRobotDataset v3.0 (Parquet, JSON and PNG), without the LeRobot library.
 
-Its library wants other versions of PyTorch, OpenCV and Rerun than this package; the files need
-``pyarrow`` and ``pandas`` alone. A row is a step: what was seen before the action, the action, and
-what came of it (``next.*``). The observation after the last action has no row.
+LeRobot needs other versions of PyTorch, OpenCV and Rerun than this package; the files need only
+``pyarrow`` and ``pandas``. A row is a step: the observation before the action, the action, and its
+outcome (``next.*``). The observation after the last action has no row.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ Columns = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Steps:
-    """What happened in an episode of N steps.
+    """Data of an episode of N steps.
 
     Attributes:
-        observations: name to (N + 1, ...), ``""`` for one that has no parts.
+        observations: name to (N + 1, ...); ``""`` names an observation without parts.
         infos: name to (N + 1, ...).
         actions: (N,) or (N, numbers).
         rewards: (N,).
@@ -49,7 +49,7 @@ class Steps:
     truncated: NDArray[np.bool_]
 
     def columns(self) -> Columns:
-        """By LeRobot's names, (N, ...) each; images (N, H, W, 3) uint8, all others (N, k)."""
+        """Columns by LeRobot's names: images (N, H, W, 3) uint8, all others (N, k)."""
         last = slice(None, -1)
         images = {f"observation.images.{k}": v[last] for k, v in self.observations.items()
                   if v.ndim == 4}  # fmt: skip
@@ -69,10 +69,10 @@ class DatasetWriter:
     """Writes episodes into a folder, one after another.
 
     Args:
-        folder: of the dataset; it is made.
-        task: what was to be done, in words.
-        fps: steps a second, by which the steps have times.
-        robot: what carried the camera.
+        folder: of the dataset; it is created.
+        task: description of the task in words.
+        fps: steps per second, from which timestamps follow.
+        robot: name of the camera's carrier.
     """
 
     def __init__(self, folder: Path, task: str, fps: int, robot: str) -> None:
@@ -108,7 +108,7 @@ class DatasetWriter:
         self.frames += count
 
     def _write(self, columns: Columns) -> dict[str, int]:
-        """A row group of the file in hand; its numbers."""
+        """Write a row group to the open file; return its indices."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -130,7 +130,7 @@ class DatasetWriter:
             self.writer, self.file = None, self.file + 1
 
     def close(self) -> None:
-        """Write what is known of the episodes; without it the folder is no dataset."""
+        """Write the metadata of the episodes; without it the folder is not a dataset."""
         import pandas as pd
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -162,7 +162,7 @@ class DatasetWriter:
         }
 
     def _stats(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Of all episodes together, from those of each."""
+        """Statistics of all episodes, combined from those of each."""
         for name in self.features:
             low, high, mean, std, count = (
                 np.array([episode[f"stats/{name}/{key}"] for episode in self.episodes])
@@ -184,7 +184,7 @@ def _feature(name: str, values: NDArray[Any]) -> dict[str, Any]:
 
 
 def _array(values: NDArray[Any]) -> Any:
-    """A column (N, ...): numbers, lists of a fixed length, or PNG files."""
+    """A column (N, ...) of numbers, lists of a fixed length, or PNG files."""
     import pyarrow as pa
 
     if values.ndim == 4:
@@ -202,7 +202,7 @@ def _png(image: NDArray[np.uint8]) -> bytes:
 
 
 def _stats(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Of the numbers of a column; of images by channel (3, 1, 1), values in [0, 1]."""
+    """Statistics of a column; for images per channel (3, 1, 1), values in [0, 1]."""
     wide = values.astype(np.float64)
     if values.ndim == 4:
         wide = wide.reshape(-1, values.shape[3])

@@ -15,19 +15,19 @@ from ms_slam_env.slam.slam_backend import Views
 
 
 class PredictsViews(Protocol):
-    """A map that can be looked at: SLAM, or what a robot sees of it."""
+    """A map that can be rendered: SLAM, or a robot's view of it."""
 
     def predict(self, poses: Float64, scale: float = 1.0) -> Views:
         """Views from poses (N, 4, 4) at ``scale`` times the camera's size."""
 
 
 class Lookahead:
-    """Predicts what the candidates would see, and how far that diverges from now.
+    """Predicts the candidates' views, and their divergence from the current view.
 
     Args:
         config: reference and scale.
         divergence: how divergence is measured.
-        intrinsics: of the live camera.
+        intrinsics: intrinsics of the live camera.
     """
 
     def __init__(

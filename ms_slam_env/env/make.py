@@ -1,4 +1,4 @@
-"""What Gymnasium calls to make the environments of the registered ids."""
+"""Entry point through which Gymnasium makes the registered environments."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.sequences.perturbations import make_perturbation
 from ms_slam_env.tasks import Task, find_task
 
-_FASTER = 2.0  # of the ids with fast motion, unless their option says otherwise
+_FASTER = 2.0  # default speed-up of the ids with fast motion
 
 
 def make_env(task: Any = None, perturbed_by: str | None = None, **options: Any) -> ActiveSlamEnv:
-    """Entry point of every id: one environment, of a task or of none, perturbed or not.
+    """Make an environment, with or without a task and a perturbation; entry point of every id.
 
     Raises:
         InputError: an unknown task, perturbation or option, or a value out of range.
@@ -36,14 +36,14 @@ def _make(task: Any, perturbed_by: str | None, **options: Any) -> ActiveSlamEnv:
     return _make_perturbed(perturbed_by, **options)
 
 
-# Gymnasium looks here for the modes before it makes the environment.
+# Gymnasium reads the render modes here before it makes the environment.
 make_env.metadata = {"render_modes": [*VIEWS]}  # type: ignore[attr-defined]
 
 
 def _make_for(task: Task, perturbed_by: str | None, **options: Any) -> ActiveSlamEnv:
-    """Build the environment of a task; ``options`` count more than the task's own.
+    """Build the environment of a task; ``options`` override the task's.
 
-    So do single ones of ``slam_config``; the task's are not for another SLAM.
+    So do single options of ``slam_config``. The task's are dropped for another SLAM.
     """
     own: dict[str, Any] = {"scene": task.scenes, **task.options}
     configured, given = own.pop("slam_config", {}), options.get("slam_config", {})
@@ -63,7 +63,7 @@ def _make_perturbed(
     """Build an environment with one perturbation, whose options are ``perturbation``.
 
     ``fast-motion`` makes every motion of a free camera ``factor`` (2) times as large in the same
-    time; everything else is put on the camera.
+    time; every other perturbation applies to the camera's frames.
 
     Raises:
         InputError: an unknown option, or a value out of range.
@@ -80,7 +80,7 @@ def _make_perturbed(
 
 
 def _hurried(strength: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of an environment with larger motions."""
+    """``options`` with larger motions."""
     for name in strength:
         if name != "factor":
             raise unknown("option of fast-motion in an environment", name, ("factor",))
@@ -88,5 +88,5 @@ def _hurried(strength: Mapping[str, Any], options: Mapping[str, Any]) -> dict[st
         raise InputError("fast-motion needs a free camera: an arm moves as fast as its joints")
     fast: Any = make_perturbation("fast-motion", {"factor": _FASTER, **strength})
     steps = {name: options.get(name, getattr(EnvConfig, name)) for name in ("step_m", "step_rad")}
-    EnvConfig(**steps)  # refuses what is no length
+    EnvConfig(**steps)  # refuses invalid lengths
     return {**options, **{name: fast.factor * step for name, step in steps.items()}}

@@ -1,4 +1,4 @@
-"""Observation variants: they show only what the robot itself has."""
+"""Observation variants; they show only what the robot itself knows."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ _DEPTH_SCALE_M = 4.0
 _DEPTH_CAP = _MAX_DEPTH_M / _DEPTH_SCALE_M
 _GREY_BINS = 16
 _ROWS, _COLUMNS = 6, 8
-_BLOCKS = (((10, 6, 10), 0.4), ((8, 4, 8), 1.2))  # around the camera: how many, edge in metres
+_BLOCKS = (((10, 6, 10), 0.4), ((8, 4, 8), 1.2))  # around the camera: number, edge in metres
 _GAIN_RAYS = (8, 6)
 _GAIN_CAP_M3 = 20.0  # more than a view of 4 m holds
 _HELD_STEPS, _HELD_DISCOUNT = 6, 0.93
-_SMALLEST_STEP = 1e-6  # a motion of no length is as many steps from everywhere
+_SMALLEST_STEP = 1e-6  # avoids a division by zero for a motion of length zero
 
 
 _GOAL_LOW, _GOAL_HIGH = [-2.0] * 3 + [-1.0] * 3 + [0.0] * 2, [2.0] * 3 + [1.0] * 3 + [5.0] * 2
@@ -82,8 +82,8 @@ class RGBDObservation(Observation):
 class PixelsObservation(Observation):
     """State vector (28), then small colour and depth images, channel by channel: float32.
 
-    Red, green, blue / 255 and depth / 4 m (4, 30, 40), each the mean of its part of the live image;
-    of depth, of the readings there, 0 without any.
+    Red, green, blue / 255 and depth / 4 m (4, 30, 40), each the mean over a block of the live
+    image. Depth averages the valid readings of a block; 0 if it has none.
     """
 
     image_shape = (4, 30, 40)
@@ -105,7 +105,7 @@ class PixelsObservation(Observation):
         return np.clip(vector, *self._bounds)
 
     def _small(self, image: Float32) -> Float32:
-        """Means of the parts of an image (H, W, ...)."""
+        """Block means of an image (H, W, ...)."""
         _, rows, columns = self.image_shape
         small = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA)
         return np.asarray(small, dtype=np.float32)
@@ -149,11 +149,11 @@ class LookaheadObservation(Observation):
 
 
 class MapObservation(Observation):
-    """``features``, what each motion would gain, and the space around the camera: float32.
+    """``features``, the gain of each motion, and the occupancy around the camera: float32.
 
-    After the features: the gain of each motion (n) as `expected_gain` has it, relative to the
-    largest, and the largest itself, m3; then free and occupied shares of blocks of 0.4 m
-    (2 x 10 x 6 x 10), and of 1.2 m (2 x 8 x 4 x 8), as `surrounding_occupancy` has them.
+    After the features: each motion's `expected_gain` (n) relative to the largest, and the largest
+    itself, m3; then free and occupied shares of blocks of 0.4 m (2 x 10 x 6 x 10) and of 1.2 m
+    (2 x 8 x 4 x 8), from `surrounding_occupancy`.
     """
 
     needs_occupancy = True
@@ -175,12 +175,12 @@ class MapObservation(Observation):
 
 
 class GoalsObservation(Observation):
-    """What the occupancy grid and one predicted view say of where to go: float32.
+    """Goals and motions rated by the occupancy grid and one predicted view: float32.
 
-    The state: ``features`` without the mask (140), the world's upward axis in the camera's frame
-    (3), the gain of the views of `mapping.goals_around`, m3 (232), 0 where free space does not
-    lead, the largest gain of a motion, m3, and the best goal as in ``candidates`` (8). Then
-    ``mapping.candidates.GRID_NAMES`` of each of the n motions, motion by motion.
+    The state: ``features`` without the mask (140), the world's up axis in the camera frame (3), the
+    gain of the views of `planning.goals_around`, m3 (232), 0 where they cannot be reached through
+    free space, the largest gain of a motion, m3, and the best goal as in ``candidates`` (8). Then
+    ``planning.candidates.GRID_NAMES`` of each of the n motions, motion by motion.
     """
 
     needs_occupancy = True
@@ -202,7 +202,7 @@ class GoalsObservation(Observation):
         return np.concatenate([state, numbers.ravel()]).astype(np.float32)
 
     def _parts(self, knowledge: RobotKnowledge) -> tuple[Float64, Float64]:
-        """The state (k,), and the numbers of each motion (n, numbers)."""
+        """The state (k,), and the values of each motion (n, values)."""
         grid, poses, steps = knowledge.occupancy, knowledge.candidates(), _least(knowledge.steps)
         assert grid is not None
         here, camera = knowledge.here, self._intrinsics
@@ -217,11 +217,11 @@ class GoalsObservation(Observation):
 
 
 class HeldObservation(GoalsObservation):
-    """``goals``, and of each motion what it would show if it were held for six steps: float32.
+    """``goals``, and the volume each motion would reveal if repeated for six steps: float32.
 
-    Four numbers more of each motion, as ``held-nbv`` weighs it (`mapping.held_gain`): the volume
-    that it shows, discounted by 0.93 a step, relative to that of the best motion, and the volumes
-    that the first, second and third two steps show, m3.
+    Four more values per motion, from the gain that ``held-nbv`` uses (`planning.held_gain`): the
+    revealed volume, discounted by 0.93 a step, relative to that of the best motion, and the volumes
+    that steps 1-2, 3-4 and 5-6 reveal, m3.
     """
 
     candidate_numbers = len(GRID_NAMES) + 1 + _HELD_STEPS // 2
@@ -249,12 +249,12 @@ class HeldObservation(GoalsObservation):
 
 
 class CandidatesObservation(Observation):
-    """A state of 37 numbers, then 18 for each of the n motions, candidate by candidate: float32.
+    """A state of 37 values, then 18 for each of the n motions, candidate by candidate: float32.
 
     The state: the state vector (28), the largest expected gain of a motion, m3, and the best goal
-    (`mapping.view_goals.best_goal`): where it is in the camera's frame, in units of 5 m (3), where
-    it looks there (3), and how many steps away it is, in translation and rotation, / 10 (2). The
-    numbers of a motion are those of ``mapping.candidates.NAMES``.
+    (`planning.view_goals.best_goal`): its position in the camera frame, in units of 5 m (3), its
+    viewing direction (3), and its distance in steps of translation and of rotation, / 10 (2). The
+    values of a motion are ``planning.candidates.NAMES``.
     """
 
     needs_occupancy = True
@@ -281,9 +281,9 @@ class CandidatesObservation(Observation):
 
 
 class WithConfiguration(Observation):
-    """Another observation and which of K SLAM configurations is in force, one-hot (K,) float32.
+    """Another observation, plus the current one of K SLAM configurations, one-hot (K,) float32.
 
-    At the end of a vector, or as ``slam_configuration`` of an observation of several parts.
+    Added at the end of a vector, or as ``slam_configuration`` to an observation of several parts.
     """
 
     def __init__(self, observation: Observation, num_configurations: int) -> None:
@@ -298,7 +298,7 @@ class WithConfiguration(Observation):
             self.space = _longer(space, [1] * num_configurations)
 
     def build(self, knowledge: RobotKnowledge) -> Any:
-        """Return the observation with its new part."""
+        """Return the extended observation."""
         observation = self._observation.build(knowledge)
         configuration = self._one_hot[knowledge.configuration]
         if isinstance(observation, dict):
@@ -312,7 +312,7 @@ def make_observation(
     num_motions: int,
     num_configurations: int = 1,
 ) -> Observation:
-    """Build variant ``name``, with the SLAM configuration in force if there are several."""
+    """Build variant ``name``, with the current SLAM configuration if there are several."""
     observation: Observation = POINT.find(name)(intrinsics, num_motions)
     if num_configurations == 1:
         return observation
@@ -320,12 +320,12 @@ def make_observation(
 
 
 def _least(steps: tuple[float, float]) -> tuple[float, float]:
-    """The length of a motion, where it is none something that can be divided by."""
+    """The length of a motion, bounded away from zero for division."""
     return max(steps[0], _SMALLEST_STEP), max(steps[1], _SMALLEST_STEP)
 
 
 def _seen_goal(here: Float64, goal: Float64, steps: tuple[float, float]) -> Float64:
-    """Where a goal is (3), where it looks (3), and how far away it is in steps (2), as shown."""
+    """Position (3), viewing direction (3) and distance in steps (2) of a goal, as observed."""
     T_here_goal = invert(here) @ goal
     away = distance_in_steps(here[None], goal, *steps)[0]
     return np.concatenate([T_here_goal[:3, 3] / POSITION_SCALE_M, T_here_goal[:3, 2], away / 10])
@@ -356,7 +356,7 @@ def _cell_sums(image: Float32) -> Float32:
 def _longer(
     space: spaces.Space[Any], highs: ArrayLike, lows: ArrayLike | None = None
 ) -> spaces.Box:
-    """A vector's space and more numbers, from ``lows``, or 0, to ``highs``."""
+    """Extend a vector's space by values from ``lows``, or 0, to ``highs``."""
     assert isinstance(space, spaces.Box)
     high = np.asarray(highs, dtype=np.float32)
     low = np.zeros_like(high) if lows is None else np.asarray(lows, dtype=np.float32)

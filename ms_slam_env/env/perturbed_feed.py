@@ -1,4 +1,4 @@
-"""The environment's frames with imperfections."""
+"""Apply perturbations to the environment's frames."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from ms_slam_env.sequences.perturbed_camera import Imperfections, PerturbedCamer
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 from ms_slam_env.slam.shared.state_check import MOST, SEED, ListOf, Real
 
-_EPISODE_FRAMES = 151  # one a step and the first: what runs over a whole sequence ends here
-_NEAREST_M = 0.35  # nearer than this to the camera nothing comes by itself
+_EPISODE_FRAMES = 151  # the first and one per step: effects that span a sequence end here
+_NEAREST_M = 0.35  # moving objects come no nearer to the camera than this
 
 
 class PerturbedFeed(CameraFeed):
     """Applies perturbations to each frame, by the same rules as in a rendered sequence.
 
-    Between frames the camera moves as ``PoseInterpolation`` says from the frame before to the next
-    one of the same motion; after the last one the motion goes on. What moves through the scene
-    begins where the camera of the start can see it, and waits rather than bump into the camera.
+    Between frames of one motion the camera's pose is interpolated by ``PoseInterpolation``; after
+    the last frame the motion continues. Moving objects begin where the start camera can see them,
+    and wait rather than hit the camera.
     """
 
     state_like: ClassVar[Mapping[str, Any]] = {
@@ -39,10 +39,10 @@ class PerturbedFeed(CameraFeed):
     }
 
     def __init__(self, perturbations: tuple[Perturbation, ...]) -> None:
-        """Take the perturbations.
+        """Set the perturbations.
 
         Raises:
-            InputError: one that changes how the camera moves, which is the agent's business.
+            InputError: a perturbation that changes how the camera moves; the agent decides that.
         """
         self.perturbations = perturbations
         self._imperfections = Imperfections.of(perturbations)
@@ -58,7 +58,7 @@ class PerturbedFeed(CameraFeed):
     def begin(
         self, scene: Scene, sensor: RGBDSensor, T_world_camera: Float64, noise_seed: int
     ) -> None:
-        """See the base class; camera and moving things may be in the scene already."""
+        """See the base class; camera and moving objects may be in the scene already."""
         self._path = PoseInterpolation([0.0], T_world_camera[None])
         began = (scene.name, scene.seed, noise_seed, T_world_camera.tobytes())
         if began != self._began:
@@ -70,7 +70,7 @@ class PerturbedFeed(CameraFeed):
             mover.set_state([])
 
     def _enter(self, scene: Scene, sensor: RGBDSensor, noise_seed: int) -> None:
-        """Put camera and moving things into the scene."""
+        """Put the camera and moving objects into the scene."""
         self._seed = noise_seed
         given = (scene, self._path, sensor.intrinsics, noise_seed)
         self._movers = self._imperfections.movers(*given)
@@ -87,10 +87,10 @@ class PerturbedFeed(CameraFeed):
         )
 
     def set_trajectory(self, times_s: Float64, poses: Float64) -> None:
-        """See the base class; what would come too near to the camera waits.
+        """See the base class; objects that would come too near to the camera wait.
 
         Raises:
-            InputError: the episode began before the perturbations were put on.
+            InputError: the perturbations were added after the episode began.
         """
         self._check_begun()
         self._path = PoseInterpolation(times_s, poses)
@@ -115,7 +115,7 @@ class PerturbedFeed(CameraFeed):
         )
 
     def _is_delivered(self, index: int) -> bool:
-        """Whether a sequence of this frame and those before would keep it."""
+        """Whether frame ``index`` is kept rather than dropped, given the frames before it."""
         kept = np.arange(index + 1)
         for selection in self._imperfections.selection:
             kept = kept[selection.keep(len(kept), self._seed)]
@@ -124,7 +124,7 @@ class PerturbedFeed(CameraFeed):
         return True
 
     def _meter(self, T_world_camera: Float64, index: int, time_s: float) -> Float64:
-        """Mean intensity (index + 1,) of the frames so far; one not taken has that before it."""
+        """Mean intensity (index + 1,) of the frames so far; a dropped one repeats the last."""
         if len(self._brightness) <= index:
             now = self._camera.brightness(T_world_camera, time_s)
             gap = index - len(self._brightness)
@@ -143,7 +143,7 @@ class PerturbedFeed(CameraFeed):
 
     @property
     def movers(self) -> tuple[Mover, ...]:
-        """What moves through the scene, with its poses by time."""
+        """The moving objects, with their poses by time."""
         return tuple(self._movers)
 
     @property
@@ -161,7 +161,7 @@ class PerturbedFeed(CameraFeed):
         """See the base class.
 
         Raises:
-            InputError: the episode began before the perturbations were put on.
+            InputError: the perturbations were added after the episode began.
         """
         self._check_begun()
         return {

@@ -1,4 +1,4 @@
-"""Planners: their interface, and how they are found by name."""
+"""Planner interface, and lookup of planners by name."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ RECOVERY = "recovery"
 _OPPOSITE = (0, 2, 1, 4, 3, 6, 5)  # of a translation or rotation, in the paper's order
 _REMEMBERED = 12  # motions that can be undone
 _DOUBT_M = 0.006
-"""Standard deviation of the position along some axis beyond which SLAM is taken to doubt it.
+"""Standard deviation of the position, along any axis, above which the pose counts as doubtful.
 
-Of 585 motions of training seeds in four scenes 99 in 100 of those that were tracked within 2 cm
-kept below 3.2 mm; of 16 that were not, 12 were lost or above 10 mm.
+Of 585 motions of training seeds in four scenes, 99 % of those tracked within 2 cm stayed below
+3.2 mm; of the 16 others, 12 were lost or above 10 mm.
 """
 
 
 class Planner(ABC):
     """Chooses actions for one robot.
 
-    It knows what the robot does: the observation, ``info`` without the truth (``known``) and its
-    ``robot``. One that needs the truth is a `PrivilegedPlanner`.
+    It knows only what the robot knows: the observation, ``info`` without the truth (``known``) and
+    its ``robot``. A planner that needs the truth is a `PrivilegedPlanner`.
 
     Args:
-        robot: what it sees; an unwrapped environment is looked at as a `RobotView`.
-        seed: of the planner's own random choices; an environment that was reset with the same one
-            draws others.
+        robot: the robot's view; an unwrapped environment is converted to a `RobotView`.
+        seed: of the planner's random choices; independent of an environment reset with the same
+            seed.
     """
 
     robot: RobotView
     view: ClassVar[type[RobotView]] = RobotView
-    """What it is given to see of an environment."""
+    """The view of the environment that the planner gets."""
 
     observation: str = "features"
-    """The observation variant that ``act`` expects, unless ``observation_for`` says otherwise."""
+    """The observation variant that ``act`` expects, unless ``observation_for`` is overridden."""
     recovers: bool = False
-    """Whether it undoes its last motions while tracking is lost, unless told not to."""
+    """Default of the option ``recovery``: undo the last motions while tracking is lost."""
     motions_only: bool = False
-    """Whether it cannot choose a SLAM configuration beside the motion."""
+    """Whether the planner cannot choose a SLAM configuration."""
 
     def __init__(self, robot: RobotView, seed: int = 0) -> None:
         self.robot = self.seen_of(robot)
@@ -56,10 +56,10 @@ class Planner(ABC):
 
     @classmethod
     def seen_of(cls, env: Any) -> RobotView:
-        """What a planner of this class sees of an unwrapped environment; a view stays as it is.
+        """The view that this class gets of an unwrapped environment; a view is returned as is.
 
         Raises:
-            InputError: a view without the truth, of which this planner needs to know.
+            InputError: a view without the truth, which this planner needs.
         """
         if isinstance(env, cls.view):
             return env
@@ -69,11 +69,11 @@ class Planner(ABC):
 
     @property
     def env(self) -> Any:
-        """``robot``, by the name that it had before."""
+        """``robot``, under its former name."""
         return self.robot
 
     def known(self, info: dict[str, Any]) -> dict[str, Any]:
-        """What ``act`` is to be told of the ``info`` that ``reset`` or ``step`` returned."""
+        """The part of ``info`` from ``reset`` or ``step`` that ``act`` may see."""
         return without_truth(info)
 
     @classmethod
@@ -89,43 +89,43 @@ class Planner(ABC):
         """Return the next action, given what ``reset`` or ``step`` last returned."""
 
     def preferences(self) -> NDArray[np.float64] | None:
-        """Probabilities (n,) of the actions as `act` weighed them; None: all for the one chosen."""
+        """Probabilities (n,) that the last `act` gave the actions; None: 1 for the one chosen."""
         return None
 
     def choices(self) -> NDArray[np.bool_] | None:
-        """Actions (n,) of which `act` let a policy within choose; None: it chose by itself."""
+        """Actions (n,) that the last `act` offered to an inner policy; None: it used no policy."""
         return None
 
     def instead(self, action: int) -> None:  # noqa: B027 -- most planners see what came of it
-        """Be told that another action was taken than ``act`` returned last."""
+        """Learn that ``action`` was taken instead of the one that ``act`` returned last."""
 
     def see(self, observation: Any, info: dict[str, Any]) -> None:  # noqa: B027 -- see `instead`
-        """Be shown, in place of ``act``, a step in which another chooses."""
+        """Observe a step in which another planner acts; called in place of ``act``."""
 
     def lost_by(self, action: int) -> None:  # noqa: B027 -- most planners learn nothing from it
-        """Be told that its last action lost tracking; SLAM holds the pose from before it."""
+        """Learn that the last action lost tracking; SLAM keeps the pose from before it."""
 
 
 class PrivilegedPlanner(Planner):
-    """Knows the truth: a teacher, or a bound on what there is to gain, and no rival."""
+    """A planner that knows the truth: a teacher or an upper bound, not a fair competitor."""
 
     robot: PrivilegedView
     view = PrivilegedView
 
     def known(self, info: dict[str, Any]) -> dict[str, Any]:
-        """All of it."""
+        """All of ``info``."""
         return info
 
 
 class Recovering(Planner):
-    """Undoes the last motions, newest first, while SLAM does not know where it is.
+    """Undoes the last motions, newest first, while SLAM does not know its pose.
 
-    Otherwise it asks another planner. SLAM does not know while tracking is lost, or while it says
-    by the covariance of its pose that this is doubtful.
+    Otherwise it delegates to another planner. SLAM does not know its pose while tracking is lost,
+    or while the pose covariance is too large.
 
-    The opposite of [R | t] is taken as the motion with the opposite rotation and translation: off
-    by the step's own rotation of its translation, some 2 cm at 12 cm and 12 deg. Where something is
-    in its way, its rotation alone is undone, or its translation.
+    Motion [R | t] is undone by the motion with the opposite rotation and translation. Because the
+    rotation turns the translation, this is off by some 2 cm at 12 cm and 12 deg. If that motion is
+    blocked, only the rotation or only the translation is undone.
     """
 
     def __init__(self, robot: RobotView, planner: Planner) -> None:
@@ -134,7 +134,7 @@ class Recovering(Planner):
         self._begin()
 
     def reset(self) -> None:
-        """Nothing was done yet."""
+        """Forget the motions of the last episode."""
         self._begin()
         self.planner.reset()
 
@@ -144,32 +144,32 @@ class Recovering(Planner):
         self.has_chosen = False
 
     def instead(self, action: int) -> None:
-        """Remember the motion that was made, to undo that one."""
+        """Record the motion that was made, so that it can be undone."""
         before = self.made[:-1] if self.has_chosen else [*self.made, self.undoing]
         self.made = [*before, action]
         self.planner.instead(action)
 
     def known(self, info: dict[str, Any]) -> dict[str, Any]:
-        """What the planner is to be told."""
+        """The part of ``info`` that the wrapped planner may see."""
         return self.planner.known(info)
 
     def preferences(self) -> NDArray[np.float64] | None:
-        """What the planner says; all for the motion that undoes another."""
+        """The wrapped planner's probabilities; 1 for a motion that undoes another."""
         return self.planner.preferences() if self.has_chosen else None
 
     def choices(self) -> NDArray[np.bool_] | None:
-        """What the planner says; None where a motion is undone."""
+        """The wrapped planner's choices; None when undoing a motion."""
         return self.planner.choices() if self.has_chosen else None
 
     def act(self, observation: Any, info: dict[str, Any]) -> int:
-        """Undo a motion, or what the planner says."""
+        """Undo a motion, or delegate to the wrapped planner."""
         self.has_chosen = is_known(info) or not self.made
         if self.has_chosen:
             action = self.planner.act(observation, info)
             self.made = [*self.made[1 - _REMEMBERED :], action]
             self.was_tracked = is_known(info)
             return action
-        if self.was_tracked:  # the motions undone after the first lost nothing
+        if self.was_tracked:  # only the first motion undone lost tracking
             self.planner.lost_by(self.made[-1])
         self.was_tracked = False
         self.planner.see(observation, info)
@@ -181,13 +181,13 @@ class Recovering(Planner):
 
 
 def goal_of(planner: Planner | None) -> NDArray[np.float64] | None:
-    """The pose (4, 4) that a planner is on its way to, as it believes; None for one without."""
+    """The pose (4, 4) that a planner is heading for, in its map; None if it has no goal."""
     chooses = planner.planner if isinstance(planner, Recovering) else planner
     return getattr(chooses, "goal", None)
 
 
 def is_known(info: dict[str, Any]) -> bool:
-    """Whether SLAM tracks and is sure of its pose; one that gives no covariance is."""
+    """Whether SLAM tracks and is sure of its pose; without a covariance, tracking suffices."""
     covariance = info.get("pose_covariance")
     if not info["tracking_ok"] or covariance is None:
         return bool(info["tracking_ok"])
@@ -196,7 +196,7 @@ def is_known(info: dict[str, Any]) -> bool:
 
 
 def opposite(action: int, actions: int = 49) -> int:
-    """The motion that leads back, of 49 motions or of 7 rotations.
+    """The motion that undoes ``action``, among 49 motions or 7 rotations.
 
     >>> opposite(7 * 5 + 1)  # forward and roll right: backward and roll left
     44
@@ -206,23 +206,23 @@ def opposite(action: int, actions: int = 49) -> int:
 
 
 PLANNERS = ExtensionPoint("planner", "ms_slam_env.planners", Planner)
-"""Where planners are found."""
+"""Lookup of planners by name."""
 
 
 def make_planner(text: str, env: Any, seed: int = 0, **more: Any) -> Planner:
     """Build the planner that ``NAME,option=value,...`` describes for the unwrapped ``env``.
 
-    Every planner has the option ``recovery``: while tracking is lost its last motions are undone.
+    Every planner has the option ``recovery``: undo the last motions while tracking is lost.
 
     Args:
-        text: what to build.
+        text: the planner and its options.
         env: the unwrapped environment.
-        seed: of the planner's draws.
-        **more: options beside those of the text, as paths with commas in them.
+        seed: of the planner's random choices.
+        **more: further options, such as paths that contain commas.
 
     Raises:
-        InputError: an unknown planner or option, a value that the planner refuses, or an
-            environment that wants more than motions of one that has no more.
+        InputError: an unknown planner or option, a value that the planner refuses, or a planner
+            that chooses motions only where the agent also chooses the SLAM configuration.
     """
     cls, options = _parsed(text, more)
     recovery = options.pop(RECOVERY, cls.recovers)
@@ -239,10 +239,10 @@ def make_planner(text: str, env: Any, seed: int = 0, **more: Any) -> Planner:
 
 
 def planner_observation(text: str) -> str:
-    """The observation variant that the planner ``NAME,option=value,...`` is to be shown.
+    """The observation variant that the planner ``NAME,option=value,...`` expects.
 
     Raises:
-        InputError: an unknown planner or option, or what the planner refuses.
+        InputError: an unknown planner or option, or a value that the planner refuses.
     """
     cls, options = _parsed(text, {})
     options.pop(RECOVERY, None)
@@ -259,7 +259,7 @@ def check_planner(text: str, **more: Any) -> None:
 
 
 def _parsed(text: str, more: Mapping[str, Any]) -> tuple[type[Planner], dict[str, Any]]:
-    """Class and options that ``text`` describes, with ``more`` of these."""
+    """The class and options that ``text`` describes, plus the options in ``more``."""
     name, options = parse_named(text, "planner")
     options = {**options, **more}
     cls: type[Planner] = PLANNERS.find(name)

@@ -1,4 +1,4 @@
-"""Clouds of points as pictures: near dots hide far ones, gaps between dots are closed."""
+"""Draw point clouds: near dots hide far ones, and gaps between dots are closed."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from ms_slam_env._runtime.arrays import Float64, Image
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
 
-NEAREST_M = 0.1  # what is nearer to the point of view is not drawn
+NEAREST_M = 0.1  # points nearer than this are not drawn
 BACKGROUND = 250
-_IN_FRONT_M = 0.03  # a dot covers what is this much farther, not the dots of its own surface
-_LARGEST = 4  # pixels, radius of a dot
-_CLOSED = 5  # pixels, width of a gap that is closed
+_IN_FRONT_M = 0.03  # a dot covers dots at least this much farther, so not its own surface
+_LARGEST = 4  # pixels, largest radius of a dot
+_CLOSED = 5  # pixels, width of the gaps that are closed
 
 
 def project(
     camera: Intrinsics, T_world_camera: Float64, points: Float64
 ) -> tuple[Float64, Float64]:
-    """Pixels (N, 2) and depths (N,) of points (N, 3); pixels are -1 where nothing is drawn."""
+    """Project points (N, 3) to pixels (N, 2), -1 where not drawn, and depths (N,)."""
     local = transform_points(invert(T_world_camera), points)
     in_front = local[:, 2] > NEAREST_M
     pixels = np.full((len(local), 2), -1.0)
@@ -30,7 +30,7 @@ def project(
 def render_points(
     camera: Intrinsics, T_world_camera: Float64, points: Float64, colors: Image, dots_m: Float64
 ) -> Image:
-    """Points (N, 3) with colours (N, 3) as dots of diameters (N,), a picture (H, W, 3)."""
+    """Draw points (N, 3) with colours (N, 3) as dots of diameters (N,); picture (H, W, 3)."""
     pixels, depth = project(camera, T_world_camera, points)
     u, v = np.rint(pixels).astype(np.int64).T
     inside = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
@@ -39,7 +39,7 @@ def render_points(
     picture = np.full((*camera.shape, 3), BACKGROUND, np.uint8)
     nearest = np.full(camera.shape, np.inf)
     radius = np.zeros(camera.shape)
-    picture[where] = colors[far_first]  # of several, the last is the nearest
+    picture[where] = colors[far_first]  # the nearest is written last
     nearest[where] = depth[far_first]
     radius[where] = 0.5 * dots_m[far_first] * camera.fx / depth[far_first]
     picture, nearest = _widen(picture, nearest, np.minimum(radius, _LARGEST))
@@ -47,7 +47,7 @@ def render_points(
 
 
 def _widen(picture: Image, depth: Float64, radius: Float64) -> tuple[Image, Float64]:
-    """Let each pixel cover those around it that are empty or clearly behind it."""
+    """Let each pixel cover neighbours that are empty or clearly behind it."""
     wide, nearest = picture.copy(), depth.copy()
     reach = int(np.ceil(radius.max(initial=0)))
     height, width = depth.shape

@@ -1,4 +1,4 @@
-"""Where the estimated pose comes from: SLAM, forward kinematics, or the truth."""
+"""Sources of the estimated pose: SLAM, forward kinematics, or the truth."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
 
 @dataclass(frozen=True)
 class FrameObservation:
-    """A frame and what is known of where it was taken, without looking at it.
+    """A frame, and the poses known without looking at the image.
 
     Attributes:
         frame: the live frame.
-        T_world_camera: (4, 4) the truth.
-        T_world_camera_kinematic: (4, 4) by forward kinematics, which start at the true start pose.
-        T_previous_camera_kinematic: (4, 4) motion since the last tracked frame, by forward
-            kinematics: while tracking is lost it adds up.
+        T_world_camera: (4, 4) true pose.
+        T_world_camera_kinematic: (4, 4) pose from forward kinematics, which start at the true start
+            pose.
+        T_previous_camera_kinematic: (4, 4) motion since the last tracked frame from forward
+            kinematics; it accumulates while tracking is lost.
         T_world_previous_estimate: (4, 4) estimate at the last tracked frame.
     """
 
@@ -31,33 +32,33 @@ class FrameObservation:
 
 
 class PoseSource(ABC):
-    """Says where a frame was taken and has it fused into the map."""
+    """Estimates the pose of a frame and fuses the frame into the map."""
 
     def locate(self, slam: SlamBackend, seen: FrameObservation) -> TrackResult:
-        """Fuse a frame that is not the first at the pose of :meth:`predict`."""
+        """Fuse a frame other than the first at the pose of :meth:`predict`."""
         return slam.fuse(seen.frame, self.predict(seen))
 
     @abstractmethod
     def predict(self, seen: FrameObservation) -> Float64:
-        """T_world_camera (4, 4) as far as it is known without looking at the frame."""
+        """Predict T_world_camera (4, 4) without looking at the frame."""
 
     def handle_dropped_frame(
         self, seen: FrameObservation, tracking_ok: bool, inlier_fraction: float
     ) -> TrackResult:
-        """What is known at a moment whose frame was not delivered; nothing is tracked or fused."""
+        """Report the state at a dropped frame; nothing is tracked or fused."""
         pose = self.predict(seen)
         return TrackResult(pose, tracking_ok, inlier_fraction=inlier_fraction, processed=False)
 
 
 class SlamPose(PoseSource):
-    """SLAM tracks the frame; it knows nothing of joints."""
+    """SLAM tracks the frame without using the joints."""
 
     def locate(self, slam: SlamBackend, seen: FrameObservation) -> TrackResult:
-        """Track."""
+        """Pose from SLAM alone."""
         return slam.track(seen.frame)
 
     def predict(self, seen: FrameObservation) -> Float64:
-        """Where it last was."""
+        """The last estimate."""
         return seen.T_world_previous_estimate
 
 
@@ -65,7 +66,7 @@ class GuessedSlamPose(PoseSource):
     """SLAM tracks the frame, starting from the motion that the kinematics report."""
 
     def locate(self, slam: SlamBackend, seen: FrameObservation) -> TrackResult:
-        """Track from the last estimate, moved as the joints moved."""
+        """Track, starting from the last estimate moved as the joints moved."""
         return slam.track(seen.frame, self.predict(seen))
 
     def predict(self, seen: FrameObservation) -> Float64:
@@ -82,7 +83,7 @@ class KinematicPose(PoseSource):
 
 
 class TruePose(PoseSource):
-    """The true pose: what a perfect tracker would leave to mapping."""
+    """The true pose, as from a perfect tracker; SLAM only maps."""
 
     def predict(self, seen: FrameObservation) -> Float64:
         """The true pose."""
@@ -95,7 +96,7 @@ POSE_SOURCES: dict[str, type[PoseSource]] = {
     "kinematics": KinematicPose,
     "ground_truth": TruePose,
 }
-"""Name of the option ``pose`` to variant."""
+"""Pose source of each name of the option ``pose``."""
 
 KINEMATIC_SOURCES = ("slam-kinematics", "kinematics")
-"""Those that read joints."""
+"""The sources that read joints."""

@@ -1,6 +1,6 @@
-"""Observation variants by name; each is imported where it is made.
+"""Observation variants by name; each is imported when it is built.
 
-They look at the map through kernels, which take a while to load.
+They read the map through kernels, which are slow to load.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ class Observation(ABC):
 
     space: spaces.Space[Any]
     needs_occupancy: bool = False
-    """Whether an occupancy grid is to be carved from the frames."""
+    """Whether the observation needs an occupancy grid carved from the frames."""
     candidate_numbers: int = 0
-    """Numbers of each motion at the end, motion by motion, for networks that look at them so."""
+    """Values per motion at the end of the vector, motion by motion; for networks that use them."""
     image_shape: tuple[int, ...] = ()
-    """Channels, rows and columns of an image at the end, for networks that look at it so."""
+    """Channels, rows and columns of an image at the end of the vector; for networks that use it."""
 
     @abstractmethod
     def build(self, knowledge: RobotKnowledge) -> Any:
@@ -44,7 +44,7 @@ OBSERVATIONS = {
     "held": f"{_OWN}:HeldObservation",
     "candidates": f"{_OWN}:CandidatesObservation",
 }
-"""Name of the option ``observation`` to where the variant is."""
+"""Class path of each name of the option ``observation``."""
 
 POINT = ExtensionPoint("observation", "ms_slam_env.observations", Observation, own=OBSERVATIONS)
-"""Where observations are found; each is made of intrinsics and the number of motions."""
+"""Lookup of observations; each is built from the intrinsics and the number of motions."""

@@ -1,4 +1,4 @@
-"""One composed picture that explains the moment."""
+"""Compose one picture of the episode's current state."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TARGET_COLOR = (90, 90, 90)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _MAX_DEPTH_M = 5.0
 _ERROR_AXIS_M = 0.01
-_DIVERGENCE_AXIS = 2.0  # the plots end at this many times M, or at the largest value
+_DIVERGENCE_AXIS = 2.0  # the plots reach to this many times M, or to the largest value
 
 
 def draw_moment(
@@ -35,10 +35,10 @@ def draw_moment(
     embodiment: Embodiment,
     scene: Scene,
 ) -> Image:
-    """Colour, depth, map from outside, divergences against targets, error so far.
+    """Draw colour, depth, the map from outside, divergences against targets, and error so far.
 
     Returns:
-        the picture (480, 1120, 3) uint8.
+        The picture (480, 1120, 3) uint8.
     """
     third_person, count = draw_third_person(episode, slam, embodiment, scene, _MAP)
     caption(third_person, f"map: {count} points; path: true wide green, estimated thin red")
@@ -47,7 +47,7 @@ def draw_moment(
 
 
 def draw_color(episode: Episode, scene: Scene) -> Image:
-    """What the camera sees, (240, 320, 3), and how it came there."""
+    """The camera's colour image, (240, 320, 3), captioned with the last motion."""
     image = cv2.resize(episode.last_frame.color, PANEL[::-1])
     motions = len(episode.step_divergences) - 1
     motion = f"motion {motions}: {describe(episode.action)}" if motions else "start"
@@ -78,9 +78,9 @@ def _plots(episode: Episode, targets: TargetConfig) -> list[Image]:
 
 
 def _plot(values: Float64, target: float | None, top: float, title: str, unit: str) -> Image:
-    """A line plot (160, 320, 3) of ``values`` in [0, top], the first at the start.
+    """A line plot (160, 320, 3) of ``values`` in [0, top], from the start.
 
-    A target is a dashed line, explained beside the title.
+    A target is a dashed line, labelled beside the title.
     """
     height, width = _PLOT
     canvas = np.full((height, width, 3), BACKGROUND, np.uint8)

@@ -1,4 +1,4 @@
-"""An episode in the Rerun viewer: what the camera sees, the map, the paths, and why it moved so."""
+"""Show an episode in the Rerun viewer: images, map, paths, and the reasons for each motion."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 APPLICATION = "ms_slam_env"
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
-_MOST_POINTS = 40_000  # of the map in a step; a viewer keeps every step
+_MOST_POINTS = 40_000  # map points sent per step; a viewer keeps every step
 _SURFEL_M = 0.012
 _SUBMAPS = np.array(
     [(31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (140, 86, 75)],
@@ -34,8 +34,8 @@ class EpisodeView:
 
     Entities: ``world/camera`` (true, with the images) and ``world/estimate``, ``world/path`` of
     both, ``world/map`` (in the colours of its submaps where there are several), ``world/arm``,
-    ``world/candidates`` with the divergences predicted for them, if anybody asked, ``world/goal``
-    of the planner, and over time ``divergence``, ``reward``, ``error`` and ``mapped``.
+    ``world/candidates`` with their predicted divergences, if these were computed, ``world/goal`` of
+    the planner, and over time ``divergence``, ``reward``, ``error`` and ``mapped``.
 
     Args:
         env: the unwrapped environment.
@@ -57,17 +57,17 @@ class EpisodeView:
         self.step = 0
         self.stream = rerun.RecordingStream(APPLICATION)
         self.path = path
-        if path is not None:  # through memory: on a full disk Rerun's own file is never finished
+        if path is not None:  # through memory: Rerun never finishes its own file on a full disk
             self.bytes = rerun.binary_stream(self.stream)
             self.stream.send_blueprint(self._layout())
             return
         try:
             self.stream.spawn(default_blueprint=self._layout())
-        except Exception as error:  # whatever keeps a window from being opened
+        except Exception as error:  # any reason that a window cannot be opened
             raise InputError(f"Rerun's viewer cannot be opened: {error}") from error
 
     def close(self) -> None:
-        """Send what is left, and write the file.
+        """Send the remaining data, and write the file.
 
         Raises:
             OSError: with the name of the file.
@@ -79,7 +79,7 @@ class EpisodeView:
         self.stream.disconnect()
 
     def log(self, planner: Planner | None = None) -> None:
-        """Send the present moment of the episode."""
+        """Send the current state of the episode."""
         self.stream.set_time("step", sequence=self.step)
         self._cameras()
         self._map()

@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 from ms_slam_env.config import Checked, Named, bounded
 
 _DISTANCE_CAP = 0.4  # in units of M: one violent frame must not outweigh a whole episode
-_ERROR_CAP_M = 0.1  # a lost camera's error is arbitrary; the terms for lost tracking judge it
+_ERROR_CAP_M = 0.1  # a lost camera's error is arbitrary; the terms for lost tracking penalize it
 
 
 @dataclass(frozen=True)
 class TargetConfig(Checked):
     """Motion-and-structure parameters and thresholds of the paper's Algorithm 1, line 9.
 
-    M_I and M_D are the medians of the maxima of hand-held sequences of which every twelfth frame
-    was kept, the sparsest that SLAM tracked without a loss (``ms-slam experiment frame_skipping``).
-    The thresholds and lambda were chosen on validation seeds: with larger ones the greedy planner
-    loses track as random walk does, with smaller ones it maps little.
+    M_I and M_D are medians, over hand-held sequences, of the maximum divergence when every twelfth
+    frame is kept, the largest spacing that SLAM tracked without a loss
+    (``ms-slam experiment frame_skipping``). The thresholds and lambda were chosen on validation
+    seeds: with larger ones the greedy planner loses track like a random walk, with smaller ones it
+    maps little.
 
     Attributes:
         M_I: permitted maximum of the intensity divergence, equation (11), nats.
@@ -48,7 +49,7 @@ class TargetConfig(Checked):
         return np.array([self.rho_I * self.M_I, self.rho_D * self.M_D])
 
     def distances(self, divergences: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far divergences (..., 2), nats, are from those to aim at, in units of (M_I, M_D)."""
+        """Distances of divergences (..., 2), nats, from their targets, in units of (M_I, M_D)."""
         return np.abs(divergences - self.divergence) / self.maxima
 
 
@@ -56,8 +57,8 @@ class TargetConfig(Checked):
 class RewardConfig(Checked, Named):
     """Weights of the reward terms; see :func:`reward_terms` for each term.
 
-    ``paper`` stands for what the paper's planner looks at, the distances to the divergence targets,
-    and its measure of success, the trajectory error; it asks for no map.
+    ``paper`` uses the criterion of the paper's planner, the distances to the divergence targets,
+    and its measure of success, the trajectory error; it does not reward mapping.
 
     Attributes:
         intensity_divergence: per M_I of distance to the intensity target.
@@ -82,14 +83,14 @@ class RewardConfig(Checked, Named):
 
     @classmethod
     def named(cls) -> Mapping[str, RewardConfig]:
-        """The weights by name."""
+        """The named weights."""
         unasked = ("new_surface", "lost", "lost_for_good", "blocked", "compute")
         return {"default": cls(), "paper": cls(**dict.fromkeys(unasked, 0.0))}
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one step led to.
+    """The outcome of one step.
 
     Attributes:
         divergence: (2,) intensity and depth divergence between the last two live frames.
@@ -98,7 +99,7 @@ class Outcome:
         tracking_ok: whether the frame was tracked.
         lost_for_good: whether the episode ends because tracking was lost beyond recovery.
         blocked: whether the action was masked and so did nothing.
-        configuration_cost: of the SLAM configuration, if the agent chooses it.
+        configuration_cost: cost of the SLAM configuration, if the agent chooses it.
     """
 
     divergence: NDArray[np.float64]
@@ -111,7 +112,7 @@ class Outcome:
 
 
 Reward = Callable[[Outcome], "float | Mapping[str, float]"]
-"""A reward of a user's own."""
+"""A user-defined reward."""
 
 
 def reward_terms(
@@ -119,12 +120,13 @@ def reward_terms(
 ) -> dict[str, float]:
     """Weighted terms, name to value; the reward is their sum.
 
-    Instead of weights, a function of the outcome may say them: terms by name, or one number.
+    Instead of weights, a function of the outcome can be given; it returns terms by name, or one
+    number.
 
     The two divergence terms are the summands of Algorithm 1, line 9, in units of M_I and M_D so
-    that one weight serves every scene; they alone would make an agent imitate the greedy planner.
-    Surface newly mapped in its true place is what a user wants from the camera: neither standing
-    still nor getting lost gathers any. The error terms say at once what lost surface says late.
+    that one weight suits every scene; alone they would make an agent imitate the greedy planner.
+    Surface newly mapped in its true place is the goal: neither standing still nor getting lost
+    earns any. The error terms penalize at once what would cost surface only later.
     """
     if not isinstance(weights, RewardConfig):
         value = weights(outcome)
@@ -147,5 +149,5 @@ def reward_terms(
 
 
 def _without_minus_zero(terms: dict[str, float]) -> dict[str, float]:
-    """The same terms; what counts nothing is 0.0, which -0.0 is written differently from."""
+    """Replace -0.0 by 0.0, since the two are written differently."""
     return {name: term + 0.0 for name, term in terms.items()}

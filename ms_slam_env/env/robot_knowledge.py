@@ -1,4 +1,4 @@
-"""What the robot knows after a step, and the numbers of its state."""
+"""The robot's knowledge after a step, and its state vector."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ STATE_NAMES: tuple[str, ...] = (
     *(f"translation_{name}" for name in TRANSLATIONS),
     *(f"rotation_{name.replace(' ', '_')}" for name in ROTATIONS),
 )
-"""What the numbers of the state vector are, in order.
+"""Names of the entries of the state vector, in order.
 
 Position relative to the start in units of 5 m (in the start camera's frame: x right, y down, z
 forward); the first two columns of the rotation, R_ij the component along i of the camera's axis j;
-the divergences of the last step in units of M_I and M_D; SLAM's word on its last frame, the share
-of pixels that it explained, and consecutive steps lost as a share of the patience; the last motion,
-one-hot.
+the divergences of the last step in units of M_I and M_D; whether SLAM tracked its last frame, the
+share of pixels that it explained, and consecutive steps lost as a share of the patience; the last
+motion, one-hot.
 """
 
 NUM_STATE = len(STATE_NAMES)
@@ -45,28 +45,29 @@ STATE_BOUNDS = np.array([_LOW, _HIGH], dtype=np.float32)
 
 @dataclass(frozen=True)
 class RobotKnowledge:
-    """What the robot knows after a step.
+    """The robot's knowledge after a step.
 
     Attributes:
         frame: the last live frame.
         T_start_camera: (4, 4) estimated pose relative to the start.
         divergence: (2,) of the last two live frames, in units of (M_I, M_D).
-        tracking_ok: SLAM's own word on its last frame.
+        tracking_ok: whether SLAM reports its last frame as tracked.
         inlier_fraction: share of pixels that the alignment explained.
         lost_share: consecutive steps lost, or away from the first submap, as a share of the
             patience.
-        motion: the last motion as an index of the 49, of the 7 rotations alone where the
-            translation is fixed, also where it was blocked; 0 before the first.
+        motion: index of the last motion among the 49, or among the 7 rotations where the
+            translation is fixed, even if it was blocked; 0 before the first.
         motion_mask: (n,) which motions are possible now.
-        configuration: index of the SLAM configuration in force; 0 where there is only one.
+        configuration: index of the current SLAM configuration; 0 where there is only one.
         lookahead: predicts the divergences (n, 2) of the candidates, in units of (M_I, M_D).
         here: (4, 4) estimated pose.
-        candidates: the poses (n, 4, 4) that the motions would lead to.
-        view: what the map predicts of here, at `trackability.SCALE`.
-        predicted: what the map predicts of here and of the candidates, divergences in those units.
+        candidates: poses (n, 4, 4) that the motions would lead to.
+        view: view predicted at the current pose, at `trackability.SCALE`.
+        predicted: views predicted at the current pose and the candidates, with divergences in units
+            of (M_I, M_D).
         steps: translation, metres, and rotation, radians, of a motion.
-        frames: taken on a motion.
-        occupancy: what is known of space; None where the observation does not need it.
+        frames: number of frames taken on a motion.
+        occupancy: occupancy grid; None where the observation does not need it.
     """
 
     frame: RGBDFrame
@@ -89,7 +90,7 @@ class RobotKnowledge:
 
 
 def state_vector(knowledge: RobotKnowledge) -> Float32:
-    """The numbers of ``STATE_NAMES``, (28,) float32 of order one, clipped to their bounds."""
+    """The values of ``STATE_NAMES``, (28,) float32 of order one, clipped to their bounds."""
     translation, rotation = divmod(knowledge.motion, NUM_ROTATIONS)
     state = np.concatenate(
         [

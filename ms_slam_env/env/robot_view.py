@@ -1,4 +1,4 @@
-"""What a planner may see: what the robot itself knows, and for teachers the truth besides."""
+"""Views of an episode for planners: what the robot knows and, for teachers, the truth too."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ TRUTH = (
     *("T_world_camera", "pose_error", "ate", "reward_terms"),
     *("mapped_area", "mapped_share", "scene", "scene_seed"),
 )
-"""Keys of ``info`` that a simulator can tell and a robot cannot."""
+"""Keys of ``info`` that only a simulator knows."""
 
 
 def without_truth(info: dict[str, Any]) -> dict[str, Any]:
-    """``info`` but for what only a simulator can tell."""
+    """``info`` without the keys that only a simulator knows."""
     return {key: value for key, value in info.items() if key not in TRUTH}
 
 
 class RobotView:
-    """What the robot knows of an episode, as far as it has come; planners see nothing else.
+    """The robot's knowledge of the episode so far; planners see nothing else.
 
     Poses are in SLAM's world frame, which begins at the true start pose. No attribute leads to the
-    environment, the scene or a true pose. Arrays are not to be written to.
+    environment, the scene or a true pose. Do not write to the arrays.
 
     Args:
         env: the unwrapped environment.
@@ -48,21 +48,21 @@ class RobotView:
     def __init__(self, env: ActiveSlamEnv) -> None:
         self._env = env
 
-    # -- What it is --------------------------------------------------------------------------
+    # -- The robot ---------------------------------------------------------------------------
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Of the camera."""
+        """Intrinsics of the camera."""
         return self._env.intrinsics
 
     @property
     def action_space(self) -> Any:
-        """The motions; where the agent chooses it, the SLAM configuration too."""
+        """Space of the motions and, where the agent chooses it, of the SLAM configuration."""
         return self._env.action_space
 
     @property
     def observation_space(self) -> Any:
-        """Of what ``act`` is shown."""
+        """Space of the observations that ``act`` gets."""
         return self._env.observation_space
 
     @property
@@ -77,7 +77,7 @@ class RobotView:
 
     @property
     def targets(self) -> TargetConfig:
-        """M_I, M_D and how much of them to aim at."""
+        """M_I, M_D and the shares of them to aim at."""
         return self._env.config.targets
 
     @property
@@ -87,15 +87,15 @@ class RobotView:
 
     @property
     def seconds(self) -> float | None:
-        """Simulated time that an episode has; None where its steps alone are limited."""
+        """Limit of an episode's simulated time; None where only its steps are limited."""
         return self._env.config.seconds
 
     @property
     def frames_per_motion(self) -> int:
-        """Frames that a motion from here has, as far as can be known before it is made."""
+        """Expected number of frames of a motion from here."""
         return self._env.embodiment.frames_per_motion
 
-    # -- What it has seen --------------------------------------------------------------------
+    # -- Past frames -------------------------------------------------------------------------
 
     @property
     def T_world_camera_estimate(self) -> Float64:
@@ -104,7 +104,7 @@ class RobotView:
 
     @property
     def pose_covariance(self) -> Float64 | None:
-        """(6, 6) of its twist (rho, phi) in the camera's frame; None where SLAM gave none."""
+        """(6, 6) covariance of the pose's twist (rho, phi) in the camera frame, or None."""
         return self._env.episode.pose_covariance
 
     @property
@@ -119,7 +119,7 @@ class RobotView:
 
     @property
     def step_divergences(self) -> Float64:
-        """(S + 1, 2) ``info["divergence"]`` of the start and of each of the S steps made."""
+        """(S + 1, 2) ``info["divergence"]`` at the start and after each of the S steps."""
         return self._env.episode.step_divergences
 
     @property
@@ -129,10 +129,10 @@ class RobotView:
 
     @property
     def occupancy(self) -> OccupancyGrid | None:
-        """What is known of space; None where neither the observation nor the mask needs it."""
+        """The occupancy grid; None where neither the observation nor the mask needs it."""
         return self._env.episode.occupancy
 
-    # -- What it may do, and would see -------------------------------------------------------
+    # -- Possible motions and their views ----------------------------------------------------
 
     def action_masks(self) -> NDArray[np.bool_]:
         """(n,) which actions are possible now; see the environment's option ``mask``."""
@@ -143,11 +143,11 @@ class RobotView:
         return self._env.embodiment.candidate_motions()
 
     def candidate_poses(self) -> Float64:
-        """(n, 4, 4) where each motion would bring the camera, by SLAM's estimate of now."""
+        """(n, 4, 4) poses that the motions would lead to from SLAM's current estimate."""
         return self._env.candidate_poses()
 
     def predict_candidates(self) -> Views:
-        """The view of each candidate as the map predicts it."""
+        """Views from the candidate poses, predicted from the map."""
         return self._env.predict_candidates()
 
     def lookahead(self) -> Float64:
@@ -165,7 +165,7 @@ class RobotView:
         return self._env.slam.surface_points()
 
     def submaps(self) -> Submaps:
-        """The submaps, as they hang together now."""
+        """The submaps, and which of them are joined now."""
         return self._env.slam.submaps()
 
     def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
@@ -174,13 +174,13 @@ class RobotView:
 
     @property
     def frames_counted(self) -> int:
-        """Number of the next frame as corrected poses and submaps count them; see there."""
+        """Number of the next frame, as counted by ``corrected_trajectory`` and ``submaps``."""
         return self._env.slam.frames_counted
 
     if not TYPE_CHECKING:  # mypy would take every name for an attribute
 
         def __getattr__(self, name: str) -> Any:
-            """Say who may have what is asked for."""
+            """Raise an error that says which planners may use the attribute."""
             raise AttributeError(
                 f"a {type(self).__name__} has no {name!r}: planners know what the robot knows; one "
                 "that needs the truth is a subclass of ms_slam_env.env.PrivilegedPlanner"
@@ -188,7 +188,7 @@ class RobotView:
 
 
 class PrivilegedView(RobotView):
-    """What the simulator knows besides, for teachers and bounds that are no rivals."""
+    """A view that includes the truth, for teachers and upper bounds."""
 
     @property
     def episode(self) -> Episode:
@@ -197,14 +197,14 @@ class PrivilegedView(RobotView):
 
     @property
     def scene(self) -> Scene:
-        """Where it is."""
+        """The current scene."""
         return self._env.scene
 
     @property
     def embodiment(self) -> Embodiment:
-        """What carries the camera."""
+        """The embodiment that carries the camera."""
         return self._env.embodiment
 
     def foresee_terms(self, actions: Iterable[Any]) -> list[dict[str, float]]:
-        """The terms of the reward that each of some actions would bring now."""
+        """Reward terms that each of some actions would earn now."""
         return self._env.foresee_terms(actions)

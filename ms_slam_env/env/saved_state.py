@@ -1,4 +1,4 @@
-"""Save the state of a simulation, and go on from one."""
+"""Save the state of a simulation, and resume from it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ms_slam_env.slam.shared.state_check import check_like, is_open
 def save_state(
     simulation: Simulation, settings: Mapping[str, Any], rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Everything needed to go on bit-exactly from within an episode."""
+    """Everything needed to resume bit-exactly from within an episode."""
     assert simulation.episode is not None
     return {
         "settings": settings,
@@ -37,10 +37,10 @@ def load_state(
     settings: Mapping[str, Any],
     rng: np.random.Generator,
 ) -> None:
-    """Go on from a state that `save_state` returned.
+    """Resume from a state that `save_state` returned.
 
     Raises:
-        InputError: it is no such state, or one of other settings; nothing has changed.
+        InputError: not a saved state, or one with other settings; nothing has changed.
     """
     check_parts(state)
     check_same_settings(state["settings"], settings)
@@ -58,13 +58,13 @@ def load_state(
     simulation.T_world_kinematic = state["T_world_kinematic"].copy()
     rng.bit_generator.state = state["random"]
     simulation.episode = episode.copy()
-    simulation.episode.predicted_divergences = None  # of the options that it was saved with
+    simulation.episode.predicted_divergences = None  # they belong to the options at saving
 
 
 def _check_parts_of(
     state: Mapping[str, Any], simulation: Simulation, world: World, rng: np.random.Generator
 ) -> None:
-    """Refuse parts of a state that do not belong into a world."""
+    """Refuse parts of a state that do not fit a world."""
     like = {
         "slam": simulation.fresh_slam,
         "embodiment": world.embodiment.state_like(),
@@ -80,7 +80,7 @@ def _check_parts_of(
 
 
 def _take_up(state: Mapping[str, Any], simulation: Simulation, world: World) -> None:
-    """Give SLAM, camera and robot their states; all or none."""
+    """Load the states of SLAM, camera and robot; all or none."""
     robot, feed, slam = world.embodiment, simulation.camera_feed, simulation.slam
     start = state["episode"].frames[0].T_world_camera
     undo = [partial(robot.set_state, robot.get_state())]
@@ -94,7 +94,7 @@ def _take_up(state: Mapping[str, Any], simulation: Simulation, world: World) -> 
         robot.set_state(state["embodiment"])
         feed.set_state(state["camera_feed"], world.scene, world.sensor, start)
         slam.set_state(state["slam"])
-    except Exception as error:  # whatever a part makes of what only looks like its state
+    except Exception as error:  # a part may fail in any way on a malformed state
         for back in undo:
             back()
         raise InputError(f"not a saved state: {error!r}") from error

@@ -1,4 +1,4 @@
-"""What happens in an episode: the camera is moved, its frames are taken, tracked and measured."""
+"""Run an episode: move the camera; capture, track and measure its frames."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
 
-_START_TRIES = 10  # a drawn start sees surface in most of its view: one try is nearly always enough
+_START_TRIES = 10  # a drawn start nearly always sees enough surface, so one try is enough
 
 
 @lru_cache(maxsize=4)
@@ -38,7 +38,7 @@ def _rays(intrinsics: Intrinsics) -> Float64:
 
 
 class World(NamedTuple):
-    """A scene and what an environment has in it."""
+    """A scene with an environment's sensor, carrier and coverage."""
 
     scene: Scene
     sensor: RGBDSensor
@@ -51,17 +51,17 @@ class Simulation:
 
     Args:
         config: of the environment.
-        embodiment_type: what carries the camera.
-        slam: SLAM, with what selects its frames and changes its configuration.
+        embodiment_type: type of the carrier.
+        slam: SLAM, including its frame selection and run-time adaptation.
         timings: of the stages.
 
     Attributes:
-        world: scene, sensor, carrier and coverage; there from the first start on.
+        world: scene, sensor, carrier and coverage; set at the first start.
         place: name and seed of the scene.
-        camera_feed: takes the frames.
-        divergence: measures it.
-        T_world_kinematic: (4, 4) where the carrier's kinematics have their origin.
-        episode: so far; None before the first and where none could begin.
+        camera_feed: captures the frames.
+        divergence: measures divergence.
+        T_world_kinematic: (4, 4) origin of the carrier's kinematics.
+        episode: the episode so far; None before the first and if none could begin.
         carves: whether episodes keep an occupancy grid.
     """
 
@@ -92,15 +92,15 @@ class Simulation:
 
     def enter(self, name: SceneName, scene_seed: int) -> None:
         """Go to a scene."""
-        self.episode = None  # the world of the old episode may be gone before this one begins
+        self.episode = None  # its world may be replaced before the next episode begins
         self.place = name, scene_seed
         self.world = self.world_of(name, scene_seed)
 
     def place_of(self, episode: Episode) -> tuple[SceneName, int]:
-        """Where an episode is: a scene of the options, even if a function, or one of ours.
+        """The scene and seed of an episode: a scene of the options or a built-in one.
 
         Raises:
-            InputError: another name: it may be that of code, or of a file.
+            InputError: any other name, which might refer to code or a file.
         """
         if self.place is not None:
             name, seed = self.place
@@ -113,17 +113,17 @@ class Simulation:
         return own[episode.scene], episode.scene_seed
 
     def world_of(self, name: SceneName, scene_seed: int) -> World:
-        """A scene and what stands in it."""
+        """Build a scene with its sensor, carrier and coverage."""
         scene = get_scene(name, scene_seed)
         sensor = get_sensor(name, scene_seed, self.intrinsics, self.config.noise)
         robot = self.embodiment_type.build(scene, self.config, self.timings)
         return World(scene, sensor, robot, self._coverage(scene))
 
     def start_somewhere(self, rng: np.random.Generator) -> None:
-        """Begin at the first pose drawn that can be used.
+        """Begin at the first drawn pose that is usable.
 
         Raises:
-            InputError: none of some can.
+            InputError: no usable pose in several tries.
         """
         for _ in range(_START_TRIES):
             why = self.start_at(self.world.scene.sample_start(rng), rng)
@@ -134,7 +134,7 @@ class Simulation:
         raise InputError(f"none of {_START_TRIES} drawn start poses can be used, the last: {why}")
 
     def start_at(self, start: Float64, rng: np.random.Generator) -> str:
-        """Put the camera at a pose (4, 4) and take the first frame; return why not, or nothing."""
+        """Start at a pose (4, 4) with one frame; return why that failed, or an empty string."""
         self.episode = None
         robot, scene = self.world.embodiment, self.world.scene
         try:
@@ -164,7 +164,7 @@ class Simulation:
     # -- One motion --------------------------------------------------------------------------
 
     def move(self, episode: Episode) -> tuple[bool, float]:
-        """Make the episode's motion; was it made, and which area (m2) is newly mapped?"""
+        """Make the episode's motion; return whether it was made, and the newly mapped area, m2."""
         by_map = self.config.mask == MAP
         may = not by_map or bool(self.action_masks()[episode.action])
         offset = self.world.embodiment.candidate_motions()[episode.action][:3, 3] if by_map else 0
@@ -177,7 +177,7 @@ class Simulation:
         return may and motion.made, self._track_motion(episode, motion)
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """(n,) which motions are possible now, by the truth or by what the robot knows."""
+        """(n,) which motions are possible now, by the truth or by the robot's map."""
         robot, episode = self.world.embodiment, self.episode
         if self.config.mask != MAP or episode is None:
             return robot.action_masks()
@@ -189,7 +189,7 @@ class Simulation:
         return known.copy()
 
     def _track_motion(self, episode: Episode, motion: MotionResult) -> float:
-        """Take and track the frames of a motion; return the newly mapped area, m2."""
+        """Capture and track the frames of a motion; return the newly mapped area, m2."""
         last = episode.frames[-1]
         times_s = last.time_s + motion.times_s
         self.camera_feed.set_trajectory(
@@ -211,7 +211,7 @@ class Simulation:
         return new_surface
 
     def _end_step(self, episode: Episode, divergence: Float64, energy_j: float) -> None:
-        """Close a step; its last frame, if there was one, is carved where it was tracked."""
+        """Close a step; carve its last frame, if delivered, at its tracked pose."""
         episode.end_step(divergence, energy_j)
         came = episode.frames[-1].processed
         if episode.occupancy is not None and episode.tracking_ok and came:
@@ -222,7 +222,7 @@ class Simulation:
     def _track_frame(
         self, episode: Episode, T_true: Float64, T_kinematic: Float64, time_s: float
     ) -> float:
-        """Take, track and measure one frame; return the newly mapped area, m2."""
+        """Capture, track and measure one frame; return the newly mapped area, m2."""
         with self.timings.stage("render"):
             frame = self.camera_feed.capture(T_true, len(episode.frames), time_s)
         seen = episode.observe(frame, T_true, T_kinematic, time_s)
@@ -250,25 +250,25 @@ class Simulation:
     def _divergence_of(
         self, frame: RGBDFrame, episode: Episode, before: Histograms | None
     ) -> Float64:
-        """(2,) divergence of the last frame from an earlier one; zero from none."""
+        """(2,) divergence of the last frame from an earlier one; zero if there is none."""
         grey = intensity_image(frame.color)[None]
         episode.histograms = self.divergence.histograms(grey, frame.depth[None])
         return self._divergence_from(episode, before)
 
     def _divergence_from(self, episode: Episode, before: Histograms | None) -> Float64:
-        """(2,) divergence of the frame measured last from an earlier one; zero from none."""
+        """(2,) divergence of the frame measured last from an earlier one; zero if there is none."""
         now = episode.histograms
         if before is None or now is None:
             return np.zeros(2)
         return self.divergence.divergence(now, before)[0]
 
     def _coverage(self, scene: Scene) -> CoverageGrid:
-        """Nothing of a scene is mapped yet; a lens that nobody told of bends the true rays."""
+        """Empty coverage of a scene; uncorrected lens distortion applies to the true rays."""
         bent = dataclasses.replace(self.intrinsics, distortion=self.camera_feed.lens)
         return CoverageGrid(scene, _rays(bent))
 
     def _cover(self, frame: RGBDFrame, T_true: Float64, result: TrackResult) -> float:
-        """Mark what a frame added to the map; return the newly mapped area, m2."""
+        """Mark the surface that a frame mapped; return the newly mapped area, m2."""
         if not result.fused:
             return 0.0
         depths = frame.depth, self.camera_feed.true_depth()
@@ -276,6 +276,6 @@ class Simulation:
 
     @cached_property
     def blank(self) -> Histograms:
-        """Histograms of a frame with nothing in it."""
+        """Histograms of an empty frame."""
         nothing = np.zeros((1, *self.intrinsics.shape), np.float32)
         return self.divergence.histograms(nothing, nothing)

@@ -1,6 +1,6 @@
-"""A saved state of an environment is checked before anything changes: its parts and its episode.
+"""Check the parts and the episode of a saved state before anything changes.
 
-What ``slam.state_check`` knows nothing of; the other parts are compared with fresh ones there.
+The remaining parts are compared with fresh ones in ``slam.state_check``.
 """
 
 from __future__ import annotations
@@ -66,14 +66,14 @@ _OF_RECORD = {
 _POSES = ("T_world_camera", "T_world_camera_kinematic", "T_world_camera_estimate")
 _ARRAYS_OF_RECORD = {**dict.fromkeys(_POSES, np.zeros((0, 4, 4))), "divergence": np.zeros((0, 2))}
 _ROUNDING = 1e-6  # of distances and their squares, metres
-_FARTHEST_CELL = 1_000_000  # of an occupancy grid; far from what would overflow
+_FARTHEST_CELL = 1_000_000  # of an occupancy grid; far below overflow
 
 
 def check_parts(state: Any) -> None:
-    """Refuse what has not the parts of a saved state.
+    """Refuse a state that lacks parts.
 
     Raises:
-        InputError: naming what is missing.
+        InputError: naming the missing parts.
     """
     if not isinstance(state, Mapping):
         raise InputError(f"a {type(state).__name__} is no state; give what save_state() returned")
@@ -98,7 +98,7 @@ def check_same_settings(saved: Any, own: Mapping[str, Any]) -> None:
 def _is_equal(saved: Any, own: Any) -> bool:
     try:
         return bool(saved == own)
-    except (ValueError, TypeError):  # an array where none belongs
+    except (ValueError, TypeError):  # an unexpected array
         return False
 
 
@@ -110,20 +110,20 @@ def check_episode(
     motions: int,
     carves: bool,
 ) -> None:
-    """Refuse an episode that no such environment has recorded.
+    """Refuse an episode that such an environment cannot have recorded.
 
-    What ``own``, the episode of now, has recorded itself is not looked at again.
+    Records shared with the current episode ``own`` are not checked again.
 
     Args:
         episode: of the state.
-        own: the episode of now, if there is one.
+        own: the current episode, if there is one.
         histograms: of any frame.
         shape: (H, W) of the images.
-        motions: how many there are.
-        carves: whether it keeps an occupancy grid.
+        motions: number of motions.
+        carves: whether the environment keeps an occupancy grid.
 
     Raises:
-        InputError: naming the field and what is wrong with it.
+        InputError: naming the field and its fault.
     """
     if type(episode) is not Episode:
         raise wrong("episode", f"is a {type(episode).__name__}, not an Episode")
@@ -145,7 +145,7 @@ def check_episode(
 
 
 def _check_all_fields(value: Any, where: str) -> None:
-    """A dataclass may come out of a file without some of its fields, or with more."""
+    """Refuse missing or extra fields, which a dataclass read from a file may have."""
     check_keys(vars(value), [field.name for field in fields(value)], where)
 
 
@@ -163,7 +163,7 @@ def _check_frame(frame: Any, shape: tuple[int, int]) -> None:
     check_array(frame.color, np.zeros((*shape, 3), np.uint8), "episode.frame.color")
     check_array(frame.depth, np.zeros(shape, np.float32), "episode.frame.depth")
     check_plain(frame.timestamp, 0.0, "episode.frame.timestamp")
-    replace(frame)  # looks at the values itself
+    replace(frame)  # checks the values
 
 
 def _check_histograms(one: Any, like: Histograms) -> None:
@@ -203,7 +203,7 @@ def _check_steps(divergences: Any) -> None:
 
 
 def _check_errors(episode: Episode) -> None:
-    """The sum of the errors is that of the frames, and time goes on."""
+    """Check that the error sum matches the frames, and that time never decreases."""
     total = sum(record.pose_error**2 for record in episode.frames)
     if not isclose(episode.squared_error_sum, total, rel_tol=_ROUNDING, abs_tol=_ROUNDING):
         raise wrong("episode.squared_error_sum", "is not that of its frames")

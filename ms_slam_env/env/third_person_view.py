@@ -1,4 +1,4 @@
-"""The map, the arm and the paths from outside."""
+"""Draw the map, the arm and the paths from outside."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _OUTLINE = (20, 20, 20)
 _PITCH = 0.9  # radians below the horizon
 _MAP_DOT_M = 0.02
 _ARM_DOT_M = 0.006
-_HEADROOM_M = 0.5  # what is this much higher than the camera ever was would hide the rest
-_FAR_SHARE = 0.005  # of the points that may lie beyond each edge
-_EDGE = 26  # pixels left free all around
-_ROUND_M = 0.2  # the point of view moves in steps, so that a film of it does not tremble
-_LEAST_M = 1.0  # distance of the point of view
+_HEADROOM_M = 0.5  # points this far above the camera's highest place would hide the rest
+_FAR_SHARE = 0.005  # share of the points that may lie beyond each edge
+_EDGE = 26  # pixels of margin
+_ROUND_M = 0.2  # the viewpoint moves in steps of this, so that videos do not jitter
+_LEAST_M = 1.0  # least distance of the viewpoint
 _AMBIENT = 0.45
 _TO_LIGHT = np.array([0.35, -0.3, 0.89])
 _FRUSTUM_M = 0.15
@@ -36,7 +36,7 @@ _FRUSTUM_M = 0.15
 def draw_third_person(
     episode: Episode, slam: SlamBackend, embodiment: Embodiment, scene: Scene, size: int
 ) -> tuple[Image, int]:
-    """The picture (size, size, 3), and how many points the map has."""
+    """Draw the picture (size, size, 3); also return the number of map points."""
     points, truth = slam.surface_points(), episode.trajectory_truth
     low = is_low(points, episode)
     arm = arm_dots(embodiment, scene)
@@ -48,12 +48,12 @@ def draw_third_person(
 
 
 def camera_of(width: int, height: int) -> Intrinsics:
-    """That of a picture (height, width, 3)."""
+    """Intrinsics for a picture (height, width, 3)."""
     return Intrinsics(width, width, 0.5 * (width - 1), 0.5 * (height - 1), width, height)
 
 
 def is_low(points: Float64, episode: Episode) -> NDArray[np.bool_]:
-    """Which of points (N, 3) are not far above all places where the camera was."""
+    """Which of points (N, 3) are not far above the camera's highest place."""
     highest = episode.trajectory_truth[:, 2, 3].max()
     return np.asarray(points[:, 2] < highest + _HEADROOM_M)
 
@@ -66,7 +66,7 @@ def draw_from(
     colors: Image,
     arm: tuple[Float64, Image],
 ) -> Image:
-    """A map (N, 3) in colours (N, 3), the arm's dots and both paths, from a pose (4, 4)."""
+    """Draw a map (N, 3) in colours (N, 3), the arm's dots and both paths from a pose (4, 4)."""
     truth, estimate = episode.trajectory_truth, episode.trajectory_estimate
     arm_points, arm_colors = arm
     picture = render_points(
@@ -93,7 +93,7 @@ def draw_from(
 
 
 def arm_dots(arm: Embodiment, scene: Scene) -> tuple[Float64, Image]:
-    """Shaded dots all over the arm and its column: points (N, 3), colours (N, 3); none without."""
+    """Shaded dots on the arm and its column: points and colours (N, 3); empty without an arm."""
     if not isinstance(arm, ArmEmbodiment):
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     parts = arm_parts(arm.model, arm.q, arm.T_world_base)
@@ -105,7 +105,7 @@ def arm_dots(arm: Embodiment, scene: Scene) -> tuple[Float64, Image]:
 
 
 def point_of_view(ahead: Float64, points: Float64, must: Float64, camera: Intrinsics) -> Float64:
-    """From above, looking along a direction (3,), as near as everything still fits in.
+    """Viewpoint from above, looking along a direction (3,), as near as everything still fits in.
 
     A point with coordinates (x, z) across and along the view is seen from (a, b) within the slope
     k if |x - a| <= k (z - b): the largest and smallest x -+ k z bound a and b.
@@ -134,7 +134,7 @@ def point_of_view(ahead: Float64, points: Float64, must: Float64, camera: Intrin
 
 
 def _frustum(T_world_camera: Float64) -> Float64:
-    """A camera's place and four corners (5, 3) of what it sees shortly before it."""
+    """A camera's centre and the four corners of a small view frustum, (5, 3)."""
     corners = np.array([(0, 0, 0), (-0.5, -0.4, 1), (0.5, -0.4, 1), (0.5, 0.4, 1), (-0.5, 0.4, 1)])
     return transform_points(T_world_camera, _FRUSTUM_M * corners)
 

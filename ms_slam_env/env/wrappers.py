@@ -21,11 +21,11 @@ from ms_slam_env.sequences.perturbations import make_perturbation
 
 
 class FollowStates(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
-    """Takes Gymnasium's time limit and order check along when the environment loads a state.
+    """Keeps Gymnasium's time limit and order check in step with loaded states.
 
-    They count from a reset: an environment that goes back in time, as tree search does, would be
-    truncated after the steps of all its attempts, and one that loads a state without a reset would
-    not take a step. Every environment of ``gym.make`` has this wrapper around it.
+    Both count from a reset. Without this wrapper, an environment that goes back in time, as in tree
+    search, would be truncated by the steps of all its attempts, and one that loads a state without
+    a reset would refuse to step. ``gym.make`` puts it around every environment.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
@@ -39,7 +39,7 @@ class FollowStates(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         inner.on_load = self._follow
 
     def _follow(self, steps: int) -> None:
-        """What Gymnasium's wrappers know of an episode that has had ``steps``."""
+        """Tell Gymnasium's wrappers that the episode has had ``steps`` steps."""
         env = self.env
         while isinstance(env, gymnasium.Wrapper):
             if isinstance(env, gymnasium.wrappers.TimeLimit):
@@ -49,7 +49,7 @@ class FollowStates(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
             env = env.env
 
     def __setstate__(self, pickled: dict[str, Any]) -> None:
-        """Watch the environment that was pickled along, and tell the rest where it is."""
+        """Watch the unpickled environment, and update Gymnasium's wrappers."""
         self.__dict__.update(pickled)
         self._watch()
 
@@ -57,21 +57,21 @@ class FollowStates(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
 class Perturbed(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """Perturbs the frames that the sensor of an ``ActiveSlamEnv`` gives.
 
-    SLAM and the agent both see the perturbed frames; the true poses, and what reward and info say
-    of them, stay the truth. Wrap again to combine perturbations; those of one kind apply in the
-    order in which they were put on. It takes effect at the next reset::
+    SLAM and the agent both see the perturbed frames; true poses stay true, also in the reward and
+    ``info``. Wrap again to combine perturbations; those of one kind apply in the order of wrapping.
+    Takes effect at the next reset::
 
         env = Perturbed(gym.make("MSActiveSLAM-FreeCamera-v0"), "motion-blur", exposure_s=0.03)
         env = Perturbed(env, "moving-objects", kind="box", count=2)
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], name: str, **options: Any) -> None:
-        """Put a perturbation on.
+        """Add a perturbation.
 
         Args:
             env: an ``ActiveSlamEnv``, wrapped or not.
-            name: one of ``ms_slam_env.sequences.PERTURBATIONS``, but for ``fast-motion``.
-            **options: of the perturbation; by default its own strength.
+            name: one of ``ms_slam_env.sequences.PERTURBATIONS`` except ``fast-motion``.
+            **options: of the perturbation; its defaults otherwise.
 
         Raises:
             InputError: unknown name or option, a value out of range, or no ``ActiveSlamEnv``.
@@ -84,20 +84,20 @@ class Perturbed(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordCon
         inner.perturb(make_perturbation(name, options))
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """(n,) which actions are possible now; the name is sb3-contrib's."""
+        """(n,) which actions are possible now, under the name that sb3-contrib expects."""
         return self.get_wrapper_attr("unwrapped").action_masks()
 
 
 def _is_filmed(episode: int) -> bool:
-    """Whether an episode is a cube, or a multiple of 1000."""
+    """Whether the episode's number is a cube, or a multiple of 1000."""
     return round(episode ** (1 / 3)) ** 3 == episode if episode < 1000 else episode % 1000 == 0
 
 
 class RecordVideo(gymnasium.wrappers.RecordVideo):
-    """Gymnasium's wrapper of this name, with films written by FFmpeg through imageio.
+    """Gymnasium's wrapper of the same name, but videos are written by FFmpeg through imageio.
 
-    Gymnasium writes them with MoviePy, which wants an older Pillow than others can live with.
-    Without a trigger it films the episodes that Gymnasium's does: 0, 1, 8, 27, ..., 1000, 2000, ...
+    Gymnasium's uses MoviePy, which requires an older Pillow than other dependencies accept.
+    Without a trigger it records the same episodes: 0, 1, 8, 27, ..., 1000, 2000, ...
 
     Raises:
         InputError: imageio-ffmpeg, the extra ``video``, is not installed.
@@ -115,12 +115,12 @@ class RecordVideo(gymnasium.wrappers.RecordVideo):
             needed = "imageio-ffmpeg: pip install 'ms-slam-env[video]'"
             raise InputError(f"recording videos needs {needed}")
         if episode_trigger is None and step_trigger is None:
-            episode_trigger = _is_filmed  # Gymnasium's own is behind an import of MoviePy
-        with suppress(gymnasium.error.DependencyNotInstalled):  # its last act is to ask for MoviePy
+            episode_trigger = _is_filmed  # Gymnasium's own needs MoviePy
+        with suppress(gymnasium.error.DependencyNotInstalled):  # it ends by importing MoviePy
             super().__init__(env, str(video_folder), episode_trigger, step_trigger, **options)
 
     def stop_recording(self) -> None:
-        """Write the film, and be ready for the next."""
+        """Write the video, and reset for the next one."""
         frames, self.recorded_frames = self.recorded_frames, []
         if frames:
             self._write(Path(self.video_folder, f"{self._video_name}.mp4"), frames)
@@ -130,7 +130,7 @@ class RecordVideo(gymnasium.wrappers.RecordVideo):
 
     def _write(self, path: Path, frames: list[Any]) -> None:
         even = [frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]
-        film = iio.imwrite(  # the codec wants even numbers of rows and columns
+        film = iio.imwrite(  # the codec needs even numbers of rows and columns
             "<bytes>",
             np.stack(even),
             extension=".mp4",

@@ -1,4 +1,4 @@
-"""What is known of space: occupancy, what a view would add to it, where a camera can go."""
+"""Occupancy of space, the information gain of views, and where a camera can go."""
 
 from ms_slam_env.planning.expected_gain import expected_gain, held_gain
 from ms_slam_env.planning.occupancy_grid import (

@@ -1,4 +1,4 @@
-"""What the planners look at, number by number, for each motion that can be chosen."""
+"""The values by which planners rate each candidate motion."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ NAMES: tuple[str, ...] = (
     *("d_optimality", "weakest", "slip_risk", "gain", "goal_translation", "goal_rotation"),
     *("step_x", "step_y", "step_z", "turn_x", "turn_y", "turn_z"),
 )
-"""What the numbers of a candidate are, in order.
+"""Names of the values of a candidate, in order.
 
-Whether it is possible; the divergences of its view as the map predicts it from that of here, in
-units of M_I and M_D, and how far they are from the targets (line 9 of Algorithm 1, in these units);
-the share of the view that the map fills, and the share nearer than 0.5 m; of the view's information
-H (`view_information`) log(1 + det(H)^(1/6)) and log(1 + its least eigenvalue), each a pixel, in
-1/m^2; the probability that SLAM slips, a frame (`trackability`); the expected gain relative to the
-largest; by how many steps it leads nearer to the goal, in translation and in rotation; the motion
-itself, along and about the camera's axes, in steps.
+Whether it is possible; the divergences of its predicted view from that at the current pose, in
+units of M_I and M_D, and their distance from the targets (line 9 of Algorithm 1, in these units);
+the share of the view that the map fills, and the share nearer than 0.5 m; log(1 + det(H)^(1/6)) and
+log(1 + least eigenvalue of H), H the view's information (`view_information`) per pixel, in 1/m^2;
+the probability that SLAM slips, per frame (`trackability`); the expected gain relative to the
+largest; the number of steps by which it comes nearer to the goal, in translation and in rotation;
+the motion itself, along and about the camera's axes, in steps.
 """
 
 _GAIN_RAYS = (8, 6)
@@ -53,12 +53,12 @@ GRID_NAMES: tuple[str, ...] = (
     *("goal_translation", "goal_rotation"),
     *("step_x", "step_y", "step_z", "turn_x", "turn_y", "turn_z"),
 )
-"""What the numbers of a candidate are where one predicted view and the occupancy grid are enough.
+"""Names of the values of a candidate, from one predicted view and the occupancy grid alone.
 
-As in ``NAMES``, but in place of a view of each candidate: the share of its rays that meet an
-occupied cell, and their mean depth in units of 4 m; the share of the view from here that remains in
-its image (`trackability.remaining`), that of what is then nearer than 0.5 m, and the risk to slip
-where no more than that is seen.
+As in ``NAMES``, but in place of a predicted view of each candidate: the share of its rays that hit
+an occupied cell, and their mean depth in units of 4 m; the share of the current view that remains
+in its image (`trackability.remaining`), the share of that nearer than 0.5 m, and the slip risk if
+nothing else is seen.
 """
 
 GRID_HIGHS = np.array([_BOTH_WAYS.get(name, 1) for name in GRID_NAMES], dtype=np.float32)
@@ -68,14 +68,14 @@ _DEPTH_SCALE_M = 4.0
 
 @dataclass(frozen=True)
 class PredictedViews:
-    """What the map predicts of here, first, and of where n motions lead.
+    """Views predicted at the current pose, first, and at the ends of n motions.
 
     Attributes:
         poses: (1 + n, 4, 4) T_world_camera.
-        views: 1 + n.
-        divergences: (n, 2) of the motions' views from that of here, in units of (M_I, M_D).
-        criterion: (n,) distance to the divergences to aim at in these units, depth times lambda.
-        frames: taken on a motion.
+        views: the 1 + n views.
+        divergences: (n, 2) of the motions' views from the current one, in units of (M_I, M_D).
+        criterion: (n,) distance to the target divergences in these units, depth times lambda.
+        frames: number of frames taken on a motion.
     """
 
     poses: Float64
@@ -93,13 +93,13 @@ def candidate_numbers(
     intrinsics: Intrinsics,
     steps: tuple[float, float],
 ) -> tuple[Float64, float]:
-    """The numbers (n, ``NAMES``) of the motions, within their bounds, and the largest gain, m^3.
+    """The values (n, ``NAMES``) of the motions, within their bounds, and the largest gain, m^3.
 
     Args:
-        predicted: of here and of the motions.
+        predicted: views at the current pose and after the motions.
         permitted: (n,) which motions are possible.
-        grid: what is known of space.
-        goal: (4, 4) where to go.
+        grid: the known occupancy.
+        goal: (4, 4) goal pose.
         intrinsics: of the live camera.
         steps: translation, metres, and rotation, radians, of one motion.
     """
@@ -138,18 +138,18 @@ def grid_numbers(
     steps: tuple[float, float],
     frames: int,
 ) -> tuple[Float64, float]:
-    """The numbers (n, ``GRID_NAMES``) of the motions, within bounds, and the largest gain, m^3.
+    """The values (n, ``GRID_NAMES``) of the motions, within bounds, and the largest gain, m^3.
 
     Args:
-        here: (4, 4) where the motions begin.
-        poses: (n, 4, 4) that they lead to.
-        view: one, predicted from here.
+        here: (4, 4) pose at which the motions begin.
+        poses: (n, 4, 4) poses that they lead to.
+        view: one view, predicted from ``here``.
         permitted: (n,) which motions are possible.
-        grid: what is known of space.
-        goal: (4, 4) where to go.
+        grid: the known occupancy.
+        goal: (4, 4) goal pose.
         intrinsics: of the live camera.
         steps: translation, metres, and rotation, radians, of one motion.
-        frames: taken on a motion.
+        frames: number of frames taken on a motion.
     """
     gain, depth = look_from(grid, poses, intrinsics, _GAIN_RAYS)
     H, remains, near = remaining(view, invert(here) @ poses)
@@ -173,7 +173,7 @@ def grid_numbers(
 def _ways(
     here: Float64, poses: Float64, goal: Float64, steps: tuple[float, float]
 ) -> tuple[Float64, Float64, Float64]:
-    """By how many steps motions lead nearer to a goal (n, 2), and the motions (n, 3) and (n, 3)."""
+    """Steps by which motions come nearer to a goal (n, 2), and the motions (n, 3) and (n, 3)."""
     motions = invert(here) @ poses
     turns = so3_log(motions[:, :3, :3])
     away = distance_in_steps(here[None], goal, *steps) - distance_in_steps(poses, goal, *steps)

@@ -1,4 +1,4 @@
-"""How much unknown space a camera would see from a pose."""
+"""Predict how much unknown space a camera would see from a pose."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def expected_gain(
 
         z^2 dz / (f_x f_y) * 0.85^u * 0.7^b   for each unknown cell in front of the first occupied,
 
-    where 1 / (f_x f_y) is the solid angle of a pixel on the plane at 1 m, times the pixels of a
-    ray, u counts the unknown cells (of depth) passed on the way, and b the frames in which the
-    cell was looked at without a reading: an open door beyond the reach is not gained for ever.
+    where 1 / (f_x f_y), times the pixels per ray, is the area of a ray on the plane at 1 m, u
+    counts the unknown cells (in depth) already passed, and b the frames in which the cell was in
+    view without a reading, so that an open door beyond the reach loses its gain.
     """
     return look_from(grid, poses, intrinsics, rays)[0]
 
@@ -63,16 +63,16 @@ def held_gain(
     intrinsics: Intrinsics,
     rays: tuple[int, int] = (8, 6),
 ) -> Float64:
-    """Unknown volume (n, steps) in m^3 that each step of a motion shows while it is held.
+    """Unknown volume (n, steps) in m^3 that each step of a repeated motion reveals.
 
-    As `expected_gain` of every pose on the way, but what an earlier step shows counts no more, in
-    blocks of two cells. Nothing once the camera would leave what is known to be free.
+    As `expected_gain` of every pose on the way, but blocks of two cells count only in the first
+    step that sees them. The gain is 0 once the camera would leave known free space.
 
     Args:
-        grid: what is known.
-        here: (4, 4) where the camera is.
-        motions: (n, 4, 4) each made again and again.
-        steps: how often.
+        grid: the known occupancy.
+        here: (4, 4) current pose.
+        motions: (n, 4, 4) motions to repeat.
+        steps: number of repetitions.
         intrinsics: of the camera.
         rays: of a view, across and down.
     """
@@ -100,7 +100,7 @@ def held_gain(
 
 
 def held_ways(here: Float64, motions: Float64, steps: int) -> Float64:
-    """Poses (n, steps, 4, 4) after each step of motions (n, 4, 4) made again and again."""
+    """Poses (n, steps, 4, 4) after each repetition of motions (n, 4, 4)."""
     poses = [here @ motions]
     while len(poses) < steps:
         poses.append(poses[-1] @ motions)
@@ -108,7 +108,7 @@ def held_ways(here: Float64, motions: Float64, steps: int) -> Float64:
 
 
 def spread_rays(intrinsics: Intrinsics, rays: tuple[int, int]) -> tuple[NDArray[np.float32], float]:
-    """Rays (N, 3) at depth 1 m, so many across and down an image, and the solid angle of each."""
+    """Rays (N, 3) at depth 1 m, ``rays`` across and down an image, and the solid angle of each."""
     across, down = rays
     u = (np.arange(across) + 0.5) / across * intrinsics.width - 0.5
     v = (np.arange(down) + 0.5) / down * intrinsics.height - 0.5

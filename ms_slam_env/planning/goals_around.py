@@ -1,4 +1,4 @@
-"""Views around a camera in a fixed order: what an agent can be shown of where to go."""
+"""Candidate goal views around a camera in a fixed order, for an agent's observation."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ms_slam_env.planning.view_goals import upright_poses
 
 _HEADINGS = 8
 _RINGS_M = (0.5, 1.0, 2.0)
-_HEIGHTS_M = (-0.5, 0.5)  # above where the camera is
-_PITCHES_RAD = (-0.5, 0.5)  # looked along as well where the camera is
+_HEIGHTS_M = (-0.5, 0.5)  # above the camera
+_PITCHES_RAD = (-0.5, 0.5)  # of additional views from the camera's position
 _RAYS = (6, 4)
 
 NUM_POSITIONS = 1 + len(_RINGS_M) * _HEADINGS + len(_HEIGHTS_M)
@@ -21,11 +21,12 @@ NUM_GOALS = (NUM_POSITIONS + len(_PITCHES_RAD)) * _HEADINGS
 
 
 def goals_around(here: Float64) -> Float64:
-    """Upright poses (NUM_GOALS, 4, 4) around a camera's (4, 4), ordered from its heading on.
+    """Upright poses (NUM_GOALS, 4, 4) around a camera pose (4, 4), ordered from its heading on.
 
-    Eight level views, 45 degrees apart, from each of NUM_POSITIONS positions: here, on three rings
-    (the headings of a ring one after another), below and above; then eight views from here that
-    look down and eight that look up. A camera that looks straight up or down heads along x.
+    Eight level views, 45 degrees apart, from each of NUM_POSITIONS positions: the camera's own,
+    then three rings (one heading after another), below and above; then eight views from the
+    camera's position that look down and eight that look up. The heading of a camera that looks
+    straight up or down is x.
     """
     heading = np.arctan2(here[1, 2], here[0, 2])
     around = heading + 2 * np.pi / _HEADINGS * np.arange(_HEADINGS)
@@ -42,13 +43,13 @@ def goals_around(here: Float64) -> Float64:
 def gain_around(
     grid: OccupancyGrid, here: Float64, intrinsics: Intrinsics, free: Float64
 ) -> Float64:
-    """Expected gain (NUM_GOALS,) in m^3 of `goals_around`; 0 where free space does not lead.
+    """Expected gain (NUM_GOALS,) in m^3 of `goals_around`; 0 for positions out of reach.
 
     Args:
-        grid: what is known.
-        here: (4, 4) where the camera is; there it may look in every direction.
+        grid: the known occupancy.
+        here: (4, 4) current pose; its position counts as reachable in every direction.
         intrinsics: of the camera.
-        free: centres (N, 3) of the cells that it can go to, `reachable_positions`.
+        free: centres (N, 3) of the cells that it can reach, from `reachable_positions`.
     """
     goals = goals_around(here)
     is_free = np.zeros_like(grid.log_odds, dtype=np.bool_)

@@ -1,18 +1,18 @@
-"""Warp kernels of the occupancy grid and of what predicted views tell."""
+"""Warp kernels for the occupancy grid, expected gain, and the information of predicted views."""
 
 from ms_slam_env._runtime.warp import kernel_wp as wp
 
-PASSED = wp.constant(1)  # a cell that a ray crossed which ends on a surface
+PASSED = wp.constant(1)  # a cell crossed by a ray that ends on a surface
 STRUCK = wp.constant(2)  # a cell in which a ray ended
-BLANK = wp.constant(3)  # a cell crossed by a ray without a reading: too far, or nothing there
-CAMERA_M = wp.constant(0.1)  # what is nearer, the camera fills itself
+BLANK = wp.constant(3)  # a cell crossed by a ray without a reading: surface too far, or none
+CAMERA_M = wp.constant(0.1)  # radius of the space that the camera itself fills
 CARVING_STEP = wp.constant(0.7)  # cells of depth between the points of a ray
 MARGIN = wp.constant(0.5)  # cells of depth in front of a surface that are not carved
-NEAREST_M = wp.constant(0.3)  # a sensor sees nothing nearer
-GAIN_STEP = wp.constant(0.8)  # cells of depth between the points of a ray: none is stepped over
-SEEN_THROUGH = wp.constant(0.85**0.8)  # chance that a step through unknown cells meets nothing
-BLOCK = wp.constant(2.0)  # cells along an edge of what is seen as one
-STILL_BLANK = wp.constant(0.7)  # worth of a cell after one more look without a reading
+NEAREST_M = wp.constant(0.3)  # the sensor has no readings nearer
+GAIN_STEP = wp.constant(0.8)  # cells of depth between the points of a ray, so that none is skipped
+SEEN_THROUGH = wp.constant(0.85**0.8)  # chance that a step through unknown cells hits nothing
+BLOCK = wp.constant(2.0)  # cells along an edge of a block that is counted once
+STILL_BLANK = wp.constant(0.7)  # factor on a cell's gain per look without a reading
 DEPTH_NOISE = wp.constant(wp.vec3(0.0012, 0.0019, 0.4))  # m, 1/m, m; see view_information
 
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
@@ -40,7 +40,7 @@ def mark_rays(
     mark: int,
     marks: wp.array3d[wp.int8],
 ) -> None:
-    """Put one kind of mark on the cells of every ray."""
+    """Mark the cells of every ray with one kind of mark."""
     ray = wp.tid()
     depth = depths[ray]
     z = wp.float32(CAMERA_M)
@@ -61,7 +61,7 @@ def mark_rays(
 
 @wp.func
 def _value(cells: wp.array3d[wp.int8], cell: wp.vec3i) -> int:
-    """Of a cell; 0 beyond the grid."""
+    """Value of a cell; 0 outside the grid."""
     value = wp.int32(0)
     if cell[0] >= 0:
         value = wp.int32(cells[cell[0], cell[1], cell[2]])
@@ -70,7 +70,7 @@ def _value(cells: wp.array3d[wp.int8], cell: wp.vec3i) -> int:
 
 @wp.func
 def _still_blank(blanks: wp.array3d[wp.int8], cell: wp.vec3i) -> float:
-    """Share of an unknown cell that still counts after the frames that found nothing there."""
+    """Share of an unknown cell that still counts after frames without a reading there."""
     share = wp.float32(1.0)
     looks = _value(blanks, cell)
     if looks > 0:
@@ -90,9 +90,9 @@ def sum_unknown(
     gains: wp.array2d[float],
     depths: wp.array2d[float],
 ) -> None:
-    """Unknown length of each ray of each pose, weighed by z^2 and by the chance to see it.
+    """Sum the unknown length of each ray of each pose, weighted by z^2 and the chance to see it.
 
-    And the depth of the first occupied cell that it meets, 0 if none.
+    Also returns the depth of the first occupied cell that it hits, 0 if none.
     """
     pose, ray = wp.tid()
     shape = wp.vec3i(log_odds.shape[0], log_odds.shape[1], log_odds.shape[2])
@@ -123,13 +123,13 @@ def sum_unknown_held(
     blanks: wp.array3d[wp.int8],
     cell_m: float,
     reach_m: float,
-    low: wp.vec3,  # cell in which the first block begins
-    first_seen: wp.array4d[wp.int8],  # (motions, blocks) in which step, from 1; 0: in none
+    low: wp.vec3,  # first cell of the first block
+    first_seen: wp.array4d[wp.int8],  # (motions, blocks) step that first sees it, from 1; 0: none
     gains: wp.array2d[float],  # (motions, steps)
 ) -> None:
-    """As `sum_unknown`, along motions that are held; a block counts in the first step it is seen.
+    """As `sum_unknown`, along repeated motions; a block counts in the first step that sees it.
 
-    A motion ends where the camera would stand in a cell that is not known to be free.
+    A motion ends where the camera would enter a cell that is not known to be free.
     """
     motion = wp.tid()
     shape = wp.vec3i(log_odds.shape[0], log_odds.shape[1], log_odds.shape[2])
@@ -196,13 +196,13 @@ def sum_remaining(
     normals: wp.array2d[wp.vec3],
     T_there_here: wp.array[wp.mat44],
     length: float,
-    nearest: float,  # metres: what is nearer counts as near
+    nearest: float,  # metres, below which a pixel counts as near
     focal: wp.vec2,
     centre: wp.vec2,
     sums: wp.array2d[mat66],
-    counts: wp.array2d[wp.vec2],  # pixels that remain, and near ones among them
+    counts: wp.array2d[wp.vec2],  # pixels that remain, and those of them that are near
 ) -> None:
-    """As `sum_information`, of those pixels of one view that others, near by, show as well."""
+    """As `sum_information`, over the pixels of one view that remain visible in nearby views."""
     there, v = wp.tid()
     H = mat66()
     count = wp.vec2()
@@ -233,7 +233,7 @@ def count_states(
     samples: int,  # along an edge of a block
     shares: wp.array4d[float],
 ) -> None:
-    """Shares of free (0) and occupied (1) places in each block."""
+    """Shares of free (0) and occupied (1) sample points in each block."""
     i, j, k = wp.tid()
     shape = wp.vec3i(log_odds.shape[0], log_odds.shape[1], log_odds.shape[2])
     edge = 1.0 / float(samples)

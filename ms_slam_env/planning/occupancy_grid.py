@@ -1,4 +1,4 @@
-"""Occupancy of space: carved from depth, followed where SLAM moves frames, seen from a camera."""
+"""Occupancy grids: carved from depth, carved again when SLAM moves frames, sampled by a camera."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from ms_slam_env.slam.shared.submap_frames import Submaps
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 
 FAR_M = 0.5
-"""Beyond this a grid does not say how far away the next surface is."""
+"""Largest distance to a surface that a grid reports."""
 
 _CHANGE = np.array([0, -1, 3, 0], dtype=np.int8)  # of the log-odds, by mark
-_LIMIT = 9  # of the log-odds: what was wrong for long is unlearned in as many frames
-_PAD = 16  # cells by which the arrays grow beyond what is asked: they are copied seldom
+_LIMIT = 9  # of the log-odds: even an old error is corrected within as many frames
+_PAD = 16  # extra cells by which the arrays grow, so that they are seldom copied
 
 
 class OccupancyGrid:
-    """Occupancy of cells; it grows with what is seen.
+    """Occupancy of cells; the grid grows with the space seen.
 
     Args:
         cell_m: edge of a cell, metres.
-        reach_m: depth up to which a ray carves and strikes, metres.
+        reach_m: depth up to which a ray marks free and occupied cells, metres.
     """
 
     def __init__(self, cell_m: float = 0.1, reach_m: float = 3.5) -> None:
         self.cell_m = cell_m
         self.reach_m = reach_m
         self.first: Int64 = np.zeros(3, dtype=np.int64)
-        """(3,) the first cell of the arrays, counted from the one that begins at the origin."""
+        """(3,) index of the arrays' first cell, relative to the cell that begins at the origin."""
         self.log_odds: NDArray[np.int8] = np.zeros((0, 0, 0), dtype=np.int8)
-        """(X, Y, Z) above 0: occupied; below: free; 0: unknown."""
+        """(X, Y, Z) log-odds: above 0 occupied, below 0 free, 0 unknown."""
         self.blanks: NDArray[np.int8] = np.zeros((0, 0, 0), dtype=np.int8)
-        """(X, Y, Z) in how many frames (at most 100) only rays without a reading crossed a cell."""
+        """(X, Y, Z) number of frames (at most 100) with only readingless rays through a cell."""
 
     def copy(self) -> OccupancyGrid:
         """An independent copy."""
@@ -71,7 +71,7 @@ class OccupancyGrid:
     def clearance(self, points: Float64) -> Float64:
         """Distance (N,) from points (N, 3) to the middle of the nearest occupied cell, metres.
 
-        At most `FAR_M`. What is unknown is in nobody's way.
+        At most `FAR_M`. Unknown cells count as free.
         """
         far = np.full(len(points), FAR_M)
         low, high = self.cells_of(np.stack([points.min(0) - FAR_M, points.max(0) + FAR_M]))
@@ -83,7 +83,7 @@ class OccupancyGrid:
         return np.asarray(np.minimum(near, far))
 
     def touch(self, point: Float64) -> None:
-        """Something at a point (3,) was run into: its cell is occupied until it is seen free."""
+        """Mark the cell of a collision point (3,) as occupied until it is seen free."""
         cell = np.floor(point / self.cell_m).astype(np.int64)
         self._grow(cell, cell + 1)
         self.log_odds[tuple(cell - self.first)] = _CHANGE[STRUCK]
@@ -92,7 +92,7 @@ class OccupancyGrid:
         self, depth: NDArray[np.float32], T_world_camera: Float64, intrinsics: Intrinsics
     ) -> None:
         """Carve a depth image (H, W), metres, 0 = no reading, taken at a pose (4, 4)."""
-        # As few pixels as leave no cell out between two rays, up to the reach.
+        # The largest stride that skips no cell between two rays, up to the reach.
         stride = max(1, int(intrinsics.fx * self.cell_m / self.reach_m))
         every = slice(None, None, stride)
         rays = intrinsics.rays()[every, every]
@@ -109,7 +109,7 @@ class OccupancyGrid:
                 self.cell_m,
                 self.reach_m,
             ]
-            # In this order: surface outweighs free space, and that a ray without a reading.
+            # In this order, surface overrides free space, which overrides a missing reading.
             for mark in (BLANK, PASSED, STRUCK):
                 wp.launch(mark_rays, len(directions), [*given, mark], [marks])
         self._apply(marks.numpy(), low, high)
@@ -119,12 +119,12 @@ class OccupancyGrid:
         change = _CHANGE[marks]
         old = self.log_odds[box]
         new = np.clip(old + change, -_LIMIT, _LIMIT)
-        # No measurement leads back to "unknown".
+        # No measurement makes a cell unknown again.
         self.log_odds[box] = np.where((new == 0) & (old != 0), np.sign(change), new)
         self.blanks[box] = np.minimum(self.blanks[box] + (marks == BLANK), 100)
 
     def _include(self, rays: Float64, T_world_camera: Float64) -> tuple[Int64, Int64]:
-        """Hold the whole of a view; return the indices from and up to which it reaches."""
+        """Grow to contain a whole view; return its lower and upper indices."""
         corners = self.reach_m * rays[[0, 0, -1, -1], [0, -1, 0, -1]]
         points = transform_points(T_world_camera, np.concatenate([np.zeros((1, 3)), corners]))
         cells = np.floor(points / self.cell_m).astype(np.int64)
@@ -155,14 +155,14 @@ def surrounding_occupancy(
 ) -> Float32:
     """Shares of free and of occupied space in blocks around a camera, (2, X, Y, Z) in [0, 1].
 
-    The rest of a block is unknown. Blocks lie along the camera's axes (x right, y down, z forward),
-    as many on either side of it; each is looked at in as many places as leave no cell out, but no
-    more than five along an edge.
+    The rest of a block is unknown. Blocks are aligned with the camera's axes (x right, y down, z
+    forward) and centred on it. Each is sampled densely enough to skip no cell, with at most five
+    points along an edge.
 
     Args:
-        grid: what is known.
+        grid: the known occupancy.
         T_world_camera: (4, 4).
-        blocks: X, Y, Z, how many along each axis.
+        blocks: X, Y, Z, number of blocks along each axis.
         block_m: edge of a block, metres.
     """
     samples = min(_MOST_SAMPLES, math.ceil(block_m / grid.cell_m - 1e-9))
@@ -181,15 +181,15 @@ def surrounding_occupancy(
 
 
 class _Carved(NamedTuple):
-    """A frame and where it was carved."""
+    """A frame and the pose at which it was carved."""
 
-    number: int  # as SLAM counts
+    number: int  # in SLAM's count
     depth: NDArray[np.float32]
     T_world_camera: Float64
 
 
 class HasCorrections(Protocol):
-    """Who knows where SLAM has its frames now: SLAM, or what a robot sees of it."""
+    """Provides the corrected poses of SLAM's frames: SLAM, or a robot's view of it."""
 
     @property
     def frames_counted(self) -> int:
@@ -203,14 +203,14 @@ class HasCorrections(Protocol):
 
 
 class OccupancyMap:
-    """Keeps the frames that it was carved from, and carves anew what SLAM has moved.
+    """An occupancy grid that keeps its frames and carves them again when SLAM moves them.
 
-    ``grid`` holds the frames of the present submap and of those joined to it: where another lies is
-    a guess, and what it saw would be carved in the wrong place.
+    ``grid`` holds the frames of the present submap and those joined to it. Other submaps are left
+    out: their pose is uncertain, and their frames would be carved in the wrong place.
 
     Args:
         cell_m: edge of a cell, metres.
-        reach_m: depth up to which a ray carves and strikes, metres.
+        reach_m: depth up to which a ray marks free and occupied cells, metres.
     """
 
     def __init__(self, cell_m: float = 0.1, reach_m: float = 3.5) -> None:
@@ -226,7 +226,7 @@ class OccupancyMap:
         T_world_camera: Float64,
         intrinsics: Intrinsics,
     ) -> None:
-        """Take the frame (H, W), metres, that ``slam`` tracked last, at its pose (4, 4)."""
+        """Add the frame (H, W), metres, that ``slam`` tracked last, at its pose (4, 4)."""
         number = slam.frames_counted - 1 if slam.frames_counted else len(self._frames)
         moved = self._follow(slam)
         self._frames.append(_Carved(number, depth, T_world_camera))
@@ -241,7 +241,7 @@ class OccupancyMap:
         self._in_grid = present
 
     def _follow(self, slam: HasCorrections) -> bool:
-        """Put the frames where SLAM has them now; whether one in the grid has moved by that."""
+        """Update the frames to SLAM's present poses; return whether one in the grid has moved."""
         numbers, poses = slam.corrected_trajectory()
         now = dict(zip(numbers.tolist(), poses, strict=True))
         moved = False
@@ -249,7 +249,7 @@ class OccupancyMap:
             pose = now.get(frame.number)
             if pose is None:
                 continue
-            # Each entry of the rotation tells how far the depths along an axis have turned.
+            # Each entry of the rotation gives how far points along an axis have turned.
             apart = np.abs(pose - frame.T_world_camera)[:3] @ [*[self.reach_m] * 3, 1.0]
             if apart.max() > 0.5 * self.cell_m:
                 self._frames[index] = frame._replace(T_world_camera=pose)
@@ -258,6 +258,6 @@ class OccupancyMap:
 
 
 def _of_present_submap(submaps: Submaps, numbers: list[int]) -> set[int]:
-    """Which of the frames belong to the submap of the last one, or to one that it is joined to."""
+    """The frames in the submap of the last one, or in a submap joined to it."""
     roots = submaps.joined_to[np.searchsorted(submaps.first_frames, numbers, side="right") - 1]
     return {number for number, root in zip(numbers, roots, strict=True) if root == roots[-1]}

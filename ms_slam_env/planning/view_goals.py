@@ -1,4 +1,4 @@
-"""Where a camera can go through free space, how far that is, and which poses there are worth it."""
+"""Reachable positions in free space, shortest paths to them, and the best goal pose."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _NEIGHBOURS = ndimage.generate_binary_structure(3, 1)
 
 
 def reachable_positions(grid: OccupancyGrid, position: Float64, radius_m: float) -> Float64:
-    """Centres (N, 3), metres, of the cells that a camera at ``position`` (3,) can get to.
+    """Centres (N, 3), metres, of the cells that a camera at ``position`` (3,) can reach.
 
-    Free cells within a cube of half edge ``radius_m`` whose six neighbours are free too, joined to
-    the one nearest to ``position``. Empty if there is none.
+    These are free cells within a cube of half edge ``radius_m`` whose six neighbours are free too,
+    connected to the one nearest to ``position``. Empty if there is none.
     """
     return grid.centres_of(_reachable_cells(grid, grid.cells_of(position), radius_m))
 
@@ -35,7 +35,7 @@ def _reachable_cells(grid: OccupancyGrid, here: Int64, radius_m: float) -> Int64
     free = grid.log_odds[tuple(map(slice, low, high))] < 0
     if not free.any():
         return np.zeros((0, 3), np.int64)
-    box = _box_of(free)  # a small part of the grid, which grows by what a view might reach
+    box = _box_of(free)  # a small part of the grid, which includes all that a view might reach
     low = low + [along.start for along in box]
     regions, _ = ndimage.label(_inner(free[box]), _NEIGHBOURS)
     inside = np.argwhere(regions > 0)
@@ -46,14 +46,14 @@ def _reachable_cells(grid: OccupancyGrid, here: Int64, radius_m: float) -> Int64
 
 
 def _box_of(mask: NDArray[np.bool_]) -> tuple[slice, ...]:
-    """The smallest box around what is true in a mask (X, Y, Z)."""
+    """The smallest box around the true cells of a mask (X, Y, Z)."""
     along = [np.any(mask, axis=others) for others in ((1, 2), (0, 2), (0, 1))]
     ends = [np.flatnonzero(some)[[0, -1]] for some in along]
     return tuple(slice(int(first), int(last) + 1) for first, last in ends)
 
 
 def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """What is true with its six neighbours, (X, Y, Z); nothing is beyond the border."""
+    """Cells (X, Y, Z) that are true with all six neighbours; beyond the border all are false."""
     inner = mask.copy()
     for axis in range(3):
         along, of = np.moveaxis(inner, axis, 0), np.moveaxis(mask, axis, 0)
@@ -65,12 +65,12 @@ def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Ways:
-    """The shortest ways from one place to N others.
+    """Shortest paths from one position to all N, itself included.
 
     Attributes:
-        positions: (N, 3) metres; the first is where the ways begin.
-        lengths: (N,) metres of the way to each.
-        before: (N,) the position before each on its way; negative for the first.
+        positions: (N, 3) metres; the first is the start.
+        lengths: (N,) length of the path to each, metres.
+        before: (N,) index of the position before each on its path; negative for the first.
     """
 
     positions: Float64
@@ -78,7 +78,7 @@ class Ways:
     before: NDArray[np.int32]
 
     def to(self, end: int) -> Float64:
-        """Positions (K, 3) of the way to position ``end``, where it begins the first."""
+        """Positions (K, 3) of the path to position ``end``, from the start."""
         indices = [end]
         while self.before[indices[-1]] >= 0:
             indices.append(int(self.before[indices[-1]]))
@@ -86,11 +86,10 @@ class Ways:
 
 
 def shortest_ways(grid: OccupancyGrid, position: Float64, radius_m: float) -> Ways:
-    """Ways (Dijkstra's) from ``position`` (3,) through the cells that `reachable_positions` gives.
+    """Shortest paths (Dijkstra) from ``position`` (3,) through the cells of `reachable_positions`.
 
-    Every other cell along each axis is a node, joined to those of the 26 around it: two cells with
-    free neighbours have none but free cells between them. Of the nodes only those that can be come
-    to are kept.
+    Every other cell along each axis is a node, linked to its up to 26 neighbouring nodes: between
+    two cells with free neighbours there are only free cells. Unreachable nodes are left out.
     """
     here = grid.cells_of(position)
     cells = _reachable_cells(grid, here, radius_m)
@@ -121,22 +120,22 @@ _HALF_OF_26 = np.argwhere(np.ones((3, 3, 3)))[14:] - 1
 
 
 _COST = 0.7  # a view six steps farther away is worth exp(-0.7) times as much
-GOAL_RADIUS_M = 2.5  # how far a goal may be
-_GOALS, _TURNS = 48, 16  # compared: elsewhere, and where the camera is
+GOAL_RADIUS_M = 2.5  # largest distance of a goal
+_GOALS, _TURNS = 48, 16  # goals compared elsewhere, and at the camera's position
 _GOAL_RAYS = (8, 6)
 _PITCH_RAD = 0.7
 _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 
 
 def distance_in_steps(poses: Float64, goal: Float64, step_m: float, step_rad: float) -> Float64:
-    """Translations and rotations (N, 2) of one motion each, from ``poses`` (N, 4, 4) to a goal."""
+    """Distance (N, 2) from ``poses`` (N, 4, 4) to a goal, in steps of translation and rotation."""
     metres = np.linalg.norm(poses[:, :3, 3] - goal[:3, 3], axis=1)
     cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], goal[:3, :3]) - 1) / 2
     return np.stack([metres / step_m, np.arccos(np.clip(cosine, -1, 1)) / step_rad], axis=1)
 
 
 def upright_poses(positions: Float64, yaw: Float64, pitch: Float64) -> Float64:
-    """Poses (N, 4, 4) at positions (N, 3) that look along yaw and pitch (N,), radians."""
+    """Upright poses (N, 4, 4) at positions (N, 3) that look along yaw and pitch (N,), radians."""
     forward = np.stack(
         [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=1
     )
@@ -156,25 +155,24 @@ def best_goal(
     steps: tuple[float, float],
     free: Float64 | None = None,
 ) -> Float64:
-    """The pose (4, 4) most worth its way, of some in free space and some where the camera is.
+    """The best goal pose (4, 4) among some in free space and some at the camera's position.
 
-    Gain is weighed by exp(-lambda cost) (Bircher et al., ICRA 2016), cost the distance in
-    ``steps``, metres and radians of one motion. A function of what is known alone: which cells are
-    compared, and where the camera looks from them, are drawn by a hash of the cell, so that a goal
-    stays while nothing better is found.
+    Gain is weighted by exp(-lambda cost) (Bircher et al., ICRA 2016); the cost is the distance in
+    ``steps``. The result depends on the arguments alone: the cells compared, and the views from
+    them, are drawn by a hash of the cell, so that a goal stays until a better one is found.
 
     Args:
-        grid: what is known.
-        here: (4, 4) where the camera is.
+        grid: the known occupancy.
+        here: (4, 4) current pose.
         intrinsics: of the camera.
         steps: translation, metres, and rotation, radians, of one motion.
-        free: `reachable_positions` (N, 3) within GOAL_RADIUS_M, if they are known already.
+        free: `reachable_positions` (N, 3) within GOAL_RADIUS_M, if already computed.
     """
     if free is None:
         free = reachable_positions(grid, here[:3, 3], GOAL_RADIUS_M)
     drawn = _hash(np.floor(free / grid.cell_m).astype(np.int64))
     chosen = np.arange(len(drawn))
-    if len(drawn) > _GOALS:  # all in order took a millisecond
+    if len(drawn) > _GOALS:  # a full sort took a millisecond
         chosen = np.argpartition(drawn, _GOALS)[:_GOALS]
     chosen = chosen[np.argsort(drawn[chosen], kind="stable")]
     yaw, pitch = ((drawn[chosen] >> np.uint64(k) & np.uint64(0xFFFF)) / 65536 for k in (0, 16))
@@ -190,7 +188,7 @@ def best_goal(
 
 
 def _hash(cells: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Well mixed numbers (N,) of cells (N, 3)."""
+    """Well-mixed hashes (N,) of cells (N, 3)."""
     mixed = (cells.astype(np.uint64) * _MIX).sum(axis=1, dtype=np.uint64)
     for shift in (30, 27, 31):
         mixed = (mixed ^ (mixed >> np.uint64(shift))) * _MIX[0]

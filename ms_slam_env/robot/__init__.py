@@ -1,4 +1,4 @@
-"""Motions and embodiments of the camera."""
+"""Motions of the camera, and the embodiments that carry it."""
 
 from typing import TYPE_CHECKING
 

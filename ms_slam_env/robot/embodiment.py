@@ -1,4 +1,4 @@
-"""What carries the camera."""
+"""Interface of the embodiments that carry the camera."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.geometry import make_pose, so3_exp, so3_log
 
 FRAME_PERIOD_S = 1 / 30
-"""Time between frames of a camera whose carrier has no clock of its own."""
+"""Time between frames of a camera whose carrier sets no other."""
 
 
 @dataclass(frozen=True)
 class MotionResult:
-    """What one action brought: where the camera was when its ``k >= 1`` frames were taken.
+    """Result of one action: the camera's poses at its ``k >= 1`` frames.
 
     Attributes:
-        made: whether the motion that was asked for was made.
+        made: whether the requested motion was made.
         T_world_camera: (k, 4, 4) true poses, in order of time; the last is where it ended.
         T_world_camera_kinematic: (k, 4, 4) the same poses as the carrier's kinematics report them.
         times_s: (k,) seconds since the motion began.
@@ -36,9 +36,10 @@ class MotionResult:
 
     @staticmethod
     def along(made: bool, start: Float64, motion: Float64, frames: int = 1) -> MotionResult:
-        """``frames`` frames, one a frame period, at poses that are known exactly.
+        """Result with ``frames`` frames, one per frame period, at exactly known poses.
 
-        On a straight line, turning evenly, from a pose (4, 4) on by a ``motion`` (4, 4).
+        The poses move on a straight line and turn evenly, from ``start`` (4, 4) by ``motion``
+        (4, 4).
         """
         shares = np.arange(1, frames) / frames
         turn = so3_log(motion[:3, :3]) if len(shares) else np.zeros(3)
@@ -49,18 +50,18 @@ class MotionResult:
 
 
 class HasClearance(Protocol):
-    """A world of which distances are known: a scene, or a robot's map of it."""
+    """A world with known distances: a scene, or a robot's map of it."""
 
     def clearance(self, points: Float64) -> Float64:
-        """Distance (N,) from points (N, 3) to the nearest surface, 0 inside things."""
+        """Distance (N,) from points (N, 3) to the nearest surface, 0 inside objects."""
 
 
 class Embodiment(ABC):
     """Holds the camera in the world and executes one of ``n`` candidate motions.
 
     Attributes:
-        T_world_camera: (4, 4) where the camera truly is.
-        T_world_camera_kinematic: (4, 4) where it is by the carrier's kinematics.
+        T_world_camera: (4, 4) true pose of the camera.
+        T_world_camera_kinematic: (4, 4) pose from the carrier's kinematics.
         num_actions: n.
     """
 
@@ -70,20 +71,20 @@ class Embodiment(ABC):
 
     @property
     def T_world_camera_kinematic(self) -> Float64:
-        """(4, 4) the camera by the carrier's kinematics; the truth for a carrier without joints."""
+        """(4, 4) pose from the carrier's kinematics; the true pose if it has no joints."""
         return self.T_world_camera
 
     @property
     def frames_per_motion(self) -> int:
-        """Frames that a motion from here has, as far as can be known before it is made."""
+        """Expected number of frames of a motion from here."""
         return self._frames
 
     @abstractmethod
     def reset(self, T_world_camera: Float64, rng: np.random.Generator) -> None:
-        """Put the camera at, or as near as it settles to, a start pose (4, 4).
+        """Put the camera at a start pose (4, 4), or as near to it as the carrier settles.
 
         Raises:
-            UnreachableError: it cannot be held there; the message says why.
+            UnreachableError: the camera cannot be held there; the message says why.
         """
 
     @abstractmethod
@@ -92,27 +93,27 @@ class Embodiment(ABC):
 
     @abstractmethod
     def action_masks(self) -> NDArray[np.bool_]:
-        """(n,) whether each motion can be made without touching anything."""
+        """(n,) whether each motion is possible without collision."""
 
     def masks_in(self, world: HasClearance, T_world_camera: Float64) -> NDArray[np.bool_]:
-        """(n,) the same where the camera is believed to be at a pose (4, 4) of a known ``world``.
+        """(n,) action masks for a believed camera pose (4, 4) in a known ``world``.
 
-        What the carrier knows of itself, as its joints' limits, counts as in ``action_masks``.
+        The carrier's own constraints, such as joint limits, apply as in ``action_masks``.
         """
-        return self.action_masks()  # for a carrier whose mask no world changes
+        return self.action_masks()  # for a carrier whose mask does not depend on the world
 
     @abstractmethod
     def move(self, action: int) -> MotionResult:
-        """Make motion ``action``, as far as nothing blocks it."""
+        """Make motion ``action`` unless it is blocked."""
 
     @abstractmethod
     def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly."""
+        """Everything needed to resume bit-exactly."""
 
     def state_like(self) -> dict[str, Any]:
-        """A state with which others are compared; NaN stands where there may be none."""
+        """Template against which states are checked; NaN where a value may be missing."""
         return self.get_state()
 
     @abstractmethod
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
+        """Resume from a state that ``get_state`` returned."""

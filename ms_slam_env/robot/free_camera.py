@@ -21,14 +21,14 @@ from ms_slam_env.robot.embodiment import Embodiment, HasClearance, MotionResult
 from ms_slam_env.scenes.scene import Scene, outside, words
 
 CAMERA_RADIUS_M = 0.1  # half the width of an ASUS Xtion (18 cm), rounded up
-_LOOKED_AT_M = 0.05  # between two places of a way in a known world
+_LOOKED_AT_M = 0.05  # between points checked along a path in a known world
 
 
 def check_room(scene: Scene, T_world_camera: Float64) -> Float64:
-    """Return a copy of the pose (4, 4) if the camera's ball has room there.
+    """Return a copy of the pose (4, 4) if the camera's bounding ball is free there.
 
     Raises:
-        UnreachableError: it has not.
+        UnreachableError: it is not.
     """
     position = T_world_camera[:3, 3]
     if scene.clearance(position[None])[0] < CAMERA_RADIUS_M:
@@ -44,9 +44,9 @@ class FreeCamera(Embodiment):
     """The 49 motions of the paper's decomposition, each made exactly.
 
     Args:
-        scene: to move in.
-        step_m, step_rad: of a motion.
-        frames: taken on a motion, the last at its end.
+        scene: the scene to move in.
+        step_m, step_rad: translation and rotation of a motion.
+        frames: number of frames taken on a motion, the last at its end.
     """
 
     num_actions = NUM_TRANSLATIONS * NUM_ROTATIONS
@@ -74,7 +74,7 @@ class FreeCamera(Embodiment):
         return self._motions
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """(49,) whether the camera's ball reaches each target; depends on the translation only."""
+        """(49,) whether the bounding ball can move to each target; only translation matters."""
         if self._masks is None:
             R, position = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
             ends = (position + self.step_m * TRANSLATION_DIRECTIONS @ R.T)[1:]
@@ -83,7 +83,7 @@ class FreeCamera(Embodiment):
         return self._masks.copy()
 
     def masks_in(self, world: HasClearance, T_world_camera: Float64) -> NDArray[np.bool_]:
-        """(49,) the same in a known world; a camera that is too near already may go no nearer."""
+        """(49,) masks in a known world; a camera already too near may not come nearer."""
         R, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
         ways = self.step_m * TRANSLATION_DIRECTIONS @ R.T
         parts = max(1, math.ceil(self.step_m / _LOOKED_AT_M))
@@ -94,7 +94,7 @@ class FreeCamera(Embodiment):
         return np.repeat(free, NUM_ROTATIONS)
 
     def move(self, action: int) -> MotionResult:
-        """Make motion ``action`` if nothing blocks it."""
+        """Make motion ``action`` unless it is blocked."""
         made = bool(self.action_masks()[action])
         motion = self._motions[action] if made else np.eye(4)
         result = MotionResult.along(made, self.T_world_camera, motion, self._frames)
@@ -114,10 +114,10 @@ class FreeCamera(Embodiment):
 
 
 class FixedTranslation(Embodiment):
-    """The paper's second simulation: straight-line translation, the rotation is chosen.
+    """The paper's second simulation: straight-line translation, and a choice of rotation.
 
-    The line's direction is drawn at the start among those with the most room; where the camera
-    would touch something it turns back along the same line. Arguments as of `FreeCamera`.
+    The line's direction is drawn at the start among those with the most room. Where the camera
+    would collide it reverses along the same line. Arguments as for `FreeCamera`.
     """
 
     num_actions = NUM_ROTATIONS
@@ -168,7 +168,7 @@ class FixedTranslation(Embodiment):
         return motions
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """(7,) all true: turning is always possible and the line turns back by itself."""
+        """(7,) all true: rotation is always possible, and the line reverses by itself."""
         return np.ones(NUM_ROTATIONS, dtype=bool)
 
     def move(self, action: int) -> MotionResult:

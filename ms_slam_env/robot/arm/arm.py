@@ -1,4 +1,4 @@
-"""An arm that holds the camera: its place, its candidate motions, their mask; without physics."""
+"""An arm that holds the camera: base pose, candidate motions and their mask; without physics."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from ms_slam_env.scenes.scene import Scene
 def frame_times(duration_s: float, config: ArmConfig) -> Float64:
     """Seconds (k,) after the start of a motion at which its frames are taken, the last at its end.
 
-    With ``frames_per_action = k`` they are k equal parts of the duration apart; a motion without
-    duration takes k periods of the camera. Without it they arrive at ``camera_hz``, at least one,
-    and the arm rests from the motion's end until the last of them, less than one period later.
+    With ``frames_per_action = k`` they divide the duration into k equal parts; a motion without
+    duration takes k camera periods. Otherwise they arrive at ``camera_hz``, at least one, and the
+    arm rests from the motion's end until the last of them, less than one period later.
     """
     k = config.frames_per_action
     if k is not None and duration_s > 0:
@@ -37,20 +37,20 @@ def frame_times(duration_s: float, config: ArmConfig) -> Float64:
 
 
 class ArmEmbodiment(Embodiment):
-    """An arm on a base that stands still, and the paper's 49 motions of the camera it holds.
+    """An arm on a fixed base, with the paper's 49 motions of the camera it holds.
 
     Attributes:
         scene: the world.
         config: of the arm.
         timings: charged with the stage ``mask``.
         model: the arm.
-        chain: the arm as it stands: ``model.chain``, and the column below it if there is one.
+        chain: ``model.chain``, plus the column below the base if there is one.
         motions: (49, 4, 4) the candidate motions ``T_camera_next``.
-        T_world_base: (4, 4) where the arm stands.
-        clearance_field: furniture around it.
-        feasibility: which motions it can make.
-        q: (n,) joint angles where the arm is.
-        T_world_camera: (4, 4) where the camera is.
+        T_world_base: (4, 4) pose of the base.
+        clearance_field: distances to furniture around it.
+        feasibility: checks which motions are possible.
+        q: (n,) current joint angles.
+        T_world_camera: (4, 4) current camera pose.
     """
 
     num_actions = NUM_MOTIONS
@@ -72,14 +72,14 @@ class ArmEmbodiment(Embodiment):
         """Put the arm where it can hold the camera at a start pose (4, 4).
 
         Raises:
-            UnreachableError: it cannot be held there; the message says why.
+            UnreachableError: the camera cannot be held there; the message says why.
         """
         T_world_base, q = place_arm(self.model, self.scene, T_world_camera, self.config)
         self.stand_at(T_world_base)
         self.start_at(q, rng)
 
     def stand_at(self, T_world_base: Float64) -> None:
-        """Move the base to a pose (4, 4) and look around from there."""
+        """Move the base to a pose (4, 4) and build the clearance field around it."""
         self.T_world_base = np.array(T_world_base, dtype=np.float64)
         self.clearance_field = ClearanceField(self.scene, self.T_world_base, reach_m(self.chain))
         self.feasibility = Feasibility(self.chain, self.clearance_field, self.config)
@@ -89,7 +89,7 @@ class ArmEmbodiment(Embodiment):
         self.set_joints(q)
 
     def set_joints(self, q: Float64) -> None:
-        """The arm is now at joint angles (n,)."""
+        """Set the joint angles (n,)."""
         self.q = np.array(q, dtype=np.float64)
         self.T_world_camera = self.T_world_base @ self.chain.camera_pose(self.q)
         self._probe: FeasibilityResult | None = None
@@ -97,12 +97,12 @@ class ArmEmbodiment(Embodiment):
     def planning_state(self) -> tuple[Float64, Float64]:
         """Joint angles (n,) and camera ``T_base_camera`` (4, 4) that motions are planned from.
 
-        What the arm itself believes; the truth for an arm without errors.
+        The arm's own belief; the truth for an arm without errors.
         """
         return self.q, self.chain.camera_pose(self.q)
 
     def probe(self) -> FeasibilityResult:
-        """Which of the 49 motions the arm can make from here, and how; worked out once a place."""
+        """Check which of the 49 motions are possible from here, and how; cached per position."""
         if self._probe is None:
             with self.timings.stage("mask"):
                 q, T_base_camera = self.planning_state()
@@ -111,7 +111,7 @@ class ArmEmbodiment(Embodiment):
 
     @property
     def frames_per_motion(self) -> int:
-        """Of the motion of median length among those that the arm can make from here."""
+        """Frames of the motion of median length among those possible from here."""
         probe = self.probe()
         durations = probe.duration_s[probe.ok & (probe.duration_s > 0)]
         return len(frame_times(float(np.median(durations)) if len(durations) else 0.0, self.config))
@@ -121,11 +121,11 @@ class ArmEmbodiment(Embodiment):
         return self.motions
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """(49,) whether the arm reaches each target on a straight line without touching."""
+        """(49,) whether the arm reaches each target on a straight line without collision."""
         return self.probe().ok.copy()
 
     def masks_in(self, world: HasClearance, T_world_camera: Float64) -> NDArray[np.bool_]:
-        """(49,) the same in a known world, in which the camera says where the arm stands."""
+        """(49,) masks in a known world, where the camera pose determines the base pose."""
         with self.timings.stage("mask"):
             q, T_base_camera = self.planning_state()
             T_world_base = T_world_camera @ invert(T_base_camera)
@@ -137,23 +137,23 @@ class ArmEmbodiment(Embodiment):
             )
 
     def get_state(self) -> dict[str, Any]:
-        """Where the arm stands and its joint angles; the rest follows from them."""
+        """The base pose and the joint angles; the rest follows from them."""
         return {"T_world_base": self.T_world_base.copy(), "q": self.q.copy()}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
+        """Resume from a state that ``get_state`` returned."""
         self.stand_at(state["T_world_base"])
         self.set_joints(state["q"])
 
 
 class KinematicArm(ArmEmbodiment):
-    """The arm's kinematics alone: limits, furniture and speed count, mass and errors do not."""
+    """An arm with limits, furniture and speed, but without mass and errors."""
 
     def move(self, action: int) -> MotionResult:
-        """Make motion ``action`` if the arm can, with the frames that arrive meanwhile.
+        """Make motion ``action`` if possible, with the frames that arrive meanwhile.
 
-        Action 0 and a masked action rest for one period of the camera, or for
-        ``frames_per_action`` of them.
+        Action 0 and a masked action rest for one camera period, or for ``frames_per_action``
+        periods.
         """
         probe = self.probe()
         made = bool(probe.ok[action])
@@ -180,14 +180,14 @@ class KinematicArm(ArmEmbodiment):
 
 
 _LONGEST_RAD = 1.0  # of an edge of the tree, in the joint that turns farthest
-_APART_RAD = 0.05  # of two postures on it that are looked at
+_APART_RAD = 0.05  # between postures checked along an edge
 
 
 def camera_poses(arm: ArmEmbodiment, edges: int = 600) -> Float64:
-    """Poses (K, 4, 4) in the world that the arm can bring its camera to from where it is.
+    """World poses (K, 4, 4) to which the arm can move its camera from its present posture.
 
-    Ends of the edges of a rapidly exploring random tree in joint space (LaValle, 1998), from a
-    fixed seed, on which no link touches furniture or another.
+    Ends of the collision-free edges of a rapidly exploring random tree in joint space (LaValle,
+    1998), from a fixed seed.
 
     Args:
         arm: standing in a scene.
@@ -195,7 +195,9 @@ def camera_poses(arm: ArmEmbodiment, edges: int = 600) -> Float64:
     """
     chain, start = arm.chain, arm.planning_state()[0]
     links = LinkClearance(chain, arm.clearance_field, 0.0)
-    least = min(0.0, float(links.least(start[None])[0]))  # who touches already may go away
+    least = min(
+        0.0, float(links.least(start[None])[0])
+    )  # an arm that already touches may move away
     low = np.maximum(chain.lower + LIMIT_MARGIN_RAD, start - np.pi)
     high = np.minimum(chain.upper - LIMIT_MARGIN_RAD, start + np.pi)
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Configuration of an arm: model, place, speed, controller and imperfections."""
+"""Configuration of an arm: model, base, speed, controller and imperfections."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ _MOST_RAD = math.radians(20)
 class ArmNoise(Checked, Named):
     """Imperfections of an arm beyond the sag and lag that follow from its physics.
 
-    Drawn once an episode: zero offsets of the joint sensors, hand-eye calibration. Drawn all the
-    time: reading noise, vibration. All zero is a perfect arm, the one named ``none``; these values
-    are named ``default``.
+    Drawn once per episode: zero offsets of the joint sensors, hand-eye calibration. Drawn
+    continually: reading noise, vibration. ``none`` names the perfect arm, all zero; ``default``
+    names these values.
 
     The sizes are assumed, not measured on a Mico: Kinova publishes none of them. They are chosen so
-    that kinematics is millimetres and tenths of a degree off, which is why the arm needs SLAM, and
-    vibration stays well below a millimetre.
+    that kinematics is off by millimetres and tenths of a degree, which is why the arm needs SLAM,
+    and vibration stays well below a millimetre.
 
     Attributes:
-        joint_offset_rad: standard deviation of a joint's zero offset: kinematics' bias.
+        joint_offset_rad: standard deviation of a joint's zero offset, the bias of kinematics.
         encoder_rad: standard deviation of one joint reading.
-        hand_eye_m: standard deviation, per axis, of the camera's assumed place on the hand.
+        hand_eye_m: standard deviation, per axis, of the camera's assumed position on the hand.
         hand_eye_rad: the same for its orientation.
         backlash_rad: play of each gear, from end to end.
         vibration_nm: standard deviation of the torque noise of a joint moving at full speed, for
@@ -54,11 +54,11 @@ class ArmConfig(Checked):
         model: ``mico``, or the path of an MJCF file whose hinges lead to a site with the axes of a
             camera (x right, y down, z forward).
         camera_site: name of that site.
-        base: x, y, z (metres) and yaw (radians) of the arm's base in the world; None puts the arm
-            where it can hold the camera at the start pose.
+        base: x, y, z (metres) and yaw (radians) of the arm's base in the world; None chooses a base
+            from which the arm can hold the camera at the start pose.
         frames_per_action: frames that reach SLAM during one motion, the last at its end; None for
             as many as arrive at ``camera_hz`` while the arm moves at its real speed.
-        camera_hz: frames a second.
+        camera_hz: frames per second.
         speed_m_s: speed of the camera; Kinova states 0.2 m/s for the Mico.
         speed_rad_s: rate of turn of the camera.
         joint_speed_rad_s: limit for every joint of a model that does not state its own.
@@ -79,7 +79,7 @@ class ArmConfig(Checked):
     noise: ArmNoise = field(default_factory=ArmNoise)
 
     def __post_init__(self) -> None:
-        """Refuse values out of range, noise that is none, and a base that is no place."""
+        """Refuse values out of range, invalid noise, and an invalid base."""
         super().__post_init__()
         if not isinstance(self.noise, ArmNoise):
             raise InputError(f"ArmConfig.noise = {self.noise!r} must be an ArmNoise")

@@ -1,4 +1,4 @@
-"""Where an arm stands, and how it is bent, when an episode begins."""
+"""Choose an arm's base pose and posture at the start of an episode."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from ms_slam_env.scenes.scene import Scene, enclosed, outside, words
 COLUMN_RADIUS_M = 0.08
 """Radius of the column that carries a base above the floor."""
 
-_PROBED = 4  # postures whose motions are counted
-_ENOUGH = 46  # motions: no need to look further
+_PROBED = 4  # postures whose possible motions are counted
+_ENOUGH = 46  # possible motions at which the search stops
 _PITCHES_TRIED = 2  # nearest to that of the camera
 _SEEDS = 24  # starting points of inverse kinematics for a given base
-_MET_M = 0.02  # closer than this to a surface is on it
-_GRID_M = 0.05  # vertical distance of the points of a column that are checked
+_MET_M = 0.02  # points closer than this to a surface are on it
+_GRID_M = 0.05  # vertical distance between checked points of a column
 
 
 def place_arm(
@@ -46,13 +46,13 @@ def place_arm(
 ) -> tuple[Float64, Float64]:
     """Find base pose T_world_base (4, 4) and joint angles (n,) that hold the camera at a pose.
 
-    Without ``config.base`` the arm stands upright on a column on the floor. Among the postures
-    that keep its limits and touch nothing it takes one from which most of the 49 motions are
-    possible. With ``config.base`` only the joint angles are free.
+    Without ``config.base`` the arm stands upright on a column on the floor. Of the collision-free
+    postures within its limits, one that makes most of the 49 motions possible is chosen. With
+    ``config.base`` only the joint angles are free.
 
     Raises:
-        UnreachableError: no such place or joint angles for this camera pose; the message says why.
-        InputError: ``config.base`` is no place for an arm, whatever the camera's pose.
+        UnreachableError: no such base or joint angles for this camera pose; the message says why.
+        InputError: an arm cannot stand at ``config.base``, whatever the camera's pose.
     """
     if config.base is None:
         return _stand_anywhere(model, scene, T_world_camera, config)
@@ -60,7 +60,7 @@ def place_arm(
 
 
 def standing_chain(model: ArmModel, config: ArmConfig) -> Chain:
-    """The arm's chain as it stands: on a column that its links must not touch, or on a base."""
+    """The arm's chain, including the column that its links must not touch if it has one."""
     return model.chain if config.base is not None else _on_column(model)
 
 
@@ -70,14 +70,14 @@ def _on_column(model: ArmModel) -> Chain:
 
 
 def _planning(config: ArmConfig) -> ArmConfig:
-    """What of a configuration the search for postures depends on, so that it is shared."""
+    """The parts of a configuration that the search for postures depends on, for caching."""
     return ArmConfig(
         speed_m_s=config.speed_m_s, speed_rad_s=config.speed_rad_s, clearance_m=config.clearance_m
     )
 
 
 def reach_m(chain: Chain) -> float:
-    """Distance from the base that no part of the arm exceeds: the stretched chain."""
+    """Distance from the base that no part of the arm exceeds: that of the stretched chain."""
     to_link = _stretched(chain)
     ends = np.linalg.norm(chain.capsule_ends, axis=-1).max(axis=-1, initial=0.0)
     skin = to_link[chain.capsule_link] + ends + chain.capsule_radius
@@ -98,7 +98,7 @@ def _stretched(chain: Chain) -> Float64:
 def _stand_anywhere(
     model: ArmModel, scene: Scene, T_world_camera: Float64, config: ArmConfig
 ) -> tuple[Float64, Float64]:
-    """Choose a posture with the camera's inclination; the base follows from it."""
+    """Choose a posture with the camera's pitch; the base pose follows from it."""
     _check_camera(scene, T_world_camera)
     chain = standing_chain(model, config)
     up = T_world_camera[2, :3]
@@ -172,7 +172,7 @@ def _stand_on_base(
 def _most_able(
     model: ArmModel, scene: Scene, config: ArmConfig, T_world_base: Float64, q: Float64
 ) -> tuple[Float64, Float64]:
-    """Of places (s, 4, 4) with postures (s, n), the one with the most possible motions."""
+    """The base, of (s, 4, 4) with postures (s, n), that has the most possible motions."""
     chain = standing_chain(model, config)
     motions = decompose(STEP_M, STEP_RAD)
     best, most = 0, -1
@@ -189,7 +189,7 @@ def _most_able(
 
 
 def _seeds(samples: Samples, home: Float64, target: Float64) -> Float64:
-    """Joint angles (s, n) whose camera is near a target (4, 4), and the home."""
+    """Joint angles (s, n) that put the camera near a target (4, 4), and the home posture."""
     cameras = samples.T_base_camera
     apart = np.linalg.norm(cameras[:, :3, 3] - target[:3, 3], axis=1)
     cosine = 0.5 * (np.einsum("sij,ij->s", cameras[:, :3, :3], target[:3, :3]) - 1)
@@ -199,10 +199,10 @@ def _seeds(samples: Samples, home: Float64, target: Float64) -> Float64:
 
 
 def _check_camera(scene: Scene, T_world_camera: Float64) -> None:
-    """Refuse a camera in no free space.
+    """Refuse a camera that is not in free space.
 
     Raises:
-        UnreachableError: saying where it lies.
+        UnreachableError: naming its position.
     """
     where = enclosed(scene, T_world_camera[:3, 3])
     if where:
@@ -210,10 +210,10 @@ def _check_camera(scene: Scene, T_world_camera: Float64) -> None:
 
 
 def _check_base(model: ArmModel, scene: Scene, T_world_base: Float64) -> None:
-    """Refuse a base outside the scene, or in something other than standing on it.
+    """Refuse a base outside the scene or inside an object; it may stand on one.
 
     Raises:
-        InputError: saying where it lies, or with the free space around it.
+        InputError: naming its position, or the free space around it.
     """
     where = outside(scene, T_world_base[:3, 3])
     if where:
@@ -223,7 +223,7 @@ def _check_base(model: ArmModel, scene: Scene, T_world_base: Float64) -> None:
     for index in fixed:
         a, b = transform_points(T_world_base, chain.capsule_ends[index])
         points = a + np.linspace(0, 1, 5)[:, None] * (b - a)
-        # the surface that it stands on may be as near as the base's own plane
+        # the surface below may be as near as the base plane
         height = points[:, 2] - T_world_base[2, 3] - scene.clearance_grid_m
         need = np.clip(height, 0.0, chain.capsule_radius[index])
         free = scene.clearance(points)
@@ -237,7 +237,7 @@ def _check_base(model: ArmModel, scene: Scene, T_world_base: Float64) -> None:
 
 
 def _column_is_free(scene: Scene, bases: Float64, camera: Float64) -> Bool:
-    """(s,) whether bases at (s, 3) can stand on a column down to the floor around the camera."""
+    """(s,) whether a column fits between each base (s, 3) and the floor near the camera."""
     floor = _floor_below(scene, camera)
     height = bases[:, 2] - floor
     steps = max(2, int(np.ceil(max(height.max(), 0.0) / _GRID_M)) + 1)
@@ -250,7 +250,7 @@ def _column_is_free(scene: Scene, bases: Float64, camera: Float64) -> Bool:
 
 
 def _floor_below(scene: Scene, camera: Float64) -> float:
-    """Height of the lowest thing that is met going level up to 1.2 m from the camera, then down."""
+    """Lowest height hit when going level up to 1.2 m from the camera, then straight down."""
     ticks = np.arange(-1.2, 1.3, 0.4)
     aside = np.stack(np.meshgrid(ticks, ticks, [0.0], indexing="ij"), axis=-1).reshape(-1, 1, 3)
     level = camera + aside * np.linspace(0.0, 1.0, 60)[:, None]  # (c, 60, 3)
@@ -266,7 +266,7 @@ def _floor_below(scene: Scene, camera: Float64) -> float:
 def _links_are_free(
     chain: Chain, scene: Scene, T_world_base: Float64, q: Float64, clearance_m: float
 ) -> Bool:
-    """(s,) whether the moving links keep their distance, arms (s, n) on bases (s, 4, 4)."""
+    """(s,) whether the moving links of arms (s, n) on bases (s, 4, 4) keep their clearance."""
     moving = chain.capsule_link > 0
     ends = chain.capsules(q)[:, moving]  # (s, m, 2, 3)
     share = np.linspace(0, 1, 4)[:, None]

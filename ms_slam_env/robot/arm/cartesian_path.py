@@ -55,7 +55,7 @@ class CartesianPath:
             T_end: (4, 4) last pose.
             speed_m_s: greatest speed of the position.
             speed_rad_s: greatest rate of turn.
-            least_duration_s: make the motion last at least so long, where it is one.
+            least_duration_s: least duration of the motion, unless it is none.
         """
         self._start = np.array(T_start, dtype=np.float64)
         self._step = T_end[:3, 3] - self._start[:3, 3]

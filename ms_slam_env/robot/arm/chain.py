@@ -13,7 +13,7 @@ from ms_slam_env._runtime.arrays import Float64, Int32
 from ms_slam_env.geometry import hat
 
 _SHORTEST_PART_M = 0.03  # of a capsule, between two balls that cover it
-_NEIGHBOURS = 2  # links this near touch by construction, or joint limits keep them apart
+_NEIGHBOURS = 2  # links this near in the chain touch by design, or joint limits keep them apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +106,8 @@ class Chain:
         return self.capsule_radius[self.self_pairs].sum(axis=1) + apart
 
     def covering_balls(self) -> tuple[Int32, Float64]:
-        """Parts (m,) that each capsule's axis is cut into, and the radius (m,) of balls around
-        the ends of the parts that hold the whole capsule."""
+        """Number of parts (m,) into which each capsule's axis is cut, and the radius (m,) at which
+        balls around the ends of the parts contain the whole capsule."""
         length = np.linalg.norm(self.capsule_ends[:, 1] - self.capsule_ends[:, 0], axis=1)
         longest = np.maximum(self.capsule_radius, _SHORTEST_PART_M)
         parts = np.ceil(length / longest - 1e-6).astype(np.int32)
@@ -120,7 +120,7 @@ class Chain:
 
 
 def _cross(a: Float64, b: Float64) -> Float64:
-    """Cross products (..., 3); NumPy's own takes twice as long for a few vectors."""
+    """Cross products (..., 3); twice as fast as NumPy's for a few vectors."""
     a_next, b_next = a[..., [1, 2, 0]], b[..., [1, 2, 0]]
     return (a * b_next - a_next * b)[..., [1, 2, 0]]
 
@@ -149,7 +149,7 @@ def segment_distance(a: Float64, b: Float64) -> Float64:
 
 
 def separate_pairs(chain: Chain, home: Float64) -> Chain:
-    """The chain with its ``self_pairs``: capsules more than two links apart, free at ``home``."""
+    """Add ``self_pairs``: capsules more than two links apart that do not touch at ``home``."""
     m = len(chain.capsule_link)
     first, second = np.triu_indices(m, 1)
     far = np.abs(chain.capsule_link[first] - chain.capsule_link[second]) > _NEIGHBOURS
@@ -159,7 +159,7 @@ def separate_pairs(chain: Chain, home: Float64) -> Chain:
 
 
 def with_column(chain: Chain, home: Float64, radius_m: float, height_m: float) -> Chain:
-    """The chain whose base stands on an upright column that its links must not touch."""
+    """Add an upright column below the base that the links must not touch."""
     column = np.array([[[0.0, 0.0, -radius_m], [0.0, 0.0, -max(height_m, radius_m)]]])
     extended = dataclasses.replace(
         chain,

@@ -1,4 +1,4 @@
-"""The clearance field around an arm, and the gaps its links keep to furniture and themselves."""
+"""Clearance field around an arm, and the gaps that its links keep to furniture and each other."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ _SLACK = 0.5  # of a voxel
 class ClearanceField:
     """Distances to the scene's surface in a cube around the arm's base.
 
-    The grid is aligned with the world. For a scene that keeps a grid itself it is a part of that
-    grid, so that no second interpolation adds an error; other scenes are sampled.
+    The grid is aligned with the world. For a scene that has a grid it is a part of that grid, which
+    avoids the error of a second interpolation; other scenes are sampled.
 
-    ``distance`` errs to the safe side: ``slack_m`` = half a voxel is taken off. Against the surface
-    of six scenes, a scene's grid is too large by more than 0.7 voxels at less than 1 % of points
-    (below 30 cm; by 1.4 voxels at worst, where furniture bends within a voxel).
+    ``distance`` errs to the safe side: ``slack_m`` = half a voxel is subtracted. Measured against
+    the surface of six scenes, a scene's grid is too large by more than 0.7 voxels at less than 1 %
+    of points (below 30 cm; by 1.4 voxels at worst, where furniture bends within a voxel).
 
     Attributes:
         T_world_base: (4, 4) the arm's base.
-        grid: (nx, ny, nz) float32 metres, slack taken off, at least 0; 0 inside things.
+        grid: (nx, ny, nz) float32 metres, slack subtracted, at least 0; 0 inside objects.
         origin: (3,) centre of the first voxel in the world.
         voxel_m: edge of a voxel.
-        slack_m: metres taken off every distance.
+        slack_m: metres subtracted from every distance.
     """
 
     def __init__(self, scene: HasClearance, T_world_base: Float64, reach_m: float) -> None:
@@ -48,7 +48,7 @@ class ClearanceField:
         self.grid: Float32 = np.maximum(distance - np.float32(self.slack_m), np.float32(0))
 
     def distance(self, points_base: Float64) -> Float64:
-        """Distances (N,) of points (N, 3) of the base's frame; 0 inside things or off the grid."""
+        """Distances (N,) of points (N, 3) in the base frame; 0 inside objects or off the grid."""
         world = transform_points(self.T_world_base, np.reshape(points_base, (-1, 3)))
         place = (world - self.origin) / self.voxel_m
         limit = np.array(self.grid.shape) - 1
@@ -61,9 +61,9 @@ class ClearanceField:
 
 
 def _part(scene: MeshScene, centre: Float64, reach_m: float) -> tuple[Float64, Float32]:
-    """Origin (3,) and values of the part of the scene's own grid that is within reach.
+    """Origin (3,) and values of the part of the scene's grid that is within reach.
 
-    The grid's own border is 0 all around, so a part that is empty is one voxel of it.
+    The border of the scene's grid is 0, so an empty part is one voxel of it.
     """
     free = scene.free_space
     low = np.floor((centre - reach_m - free.origin) / free.voxel_m).astype(int)
@@ -85,15 +85,15 @@ def _sampled(scene: HasClearance, centre: Float64, reach_m: float) -> tuple[Floa
     return origin, values.astype(np.float32)
 
 
-_NEAR_M = 0.05  # a gap beyond this is not limited
-_STEP_RAD = 1e-5  # of the differences that stand for derivatives
+_NEAR_M = 0.05  # larger gaps are not limited
+_STEP_RAD = 1e-5  # of finite differences
 
 
 class LinkClearance:
-    """Gaps between what an arm's links need and what they have.
+    """Gaps: the distances that an arm's links have, less the clearance that they need.
 
     Links are the chain's capsules, covered by balls. They need ``clearance_m`` to furniture and to
-    each other; pairs that are closer than that at the arm's home need half that gap.
+    each other; pairs closer than that at the arm's home need half of their gap there.
     """
 
     def __init__(self, chain: Chain, clearance_field: ClearanceField, clearance_m: float) -> None:
@@ -118,7 +118,7 @@ class LinkClearance:
         return np.concatenate([self._furniture(ends), self._self(ends)], axis=-1)
 
     def least(self, q: Float64) -> Float64:
-        """(k,) the least of the gaps at joint angles (k, n), or 0 where all are above it."""
+        """(k,) the least of the gaps at joint angles (k, n), or 0 where all are positive."""
         ends = self._chain.capsules(q)
         result = np.minimum(self._self(ends).min(axis=-1, initial=0.0), 0.0)
         middles = ends[..., self._moving, :, :].mean(axis=-2)
@@ -155,12 +155,12 @@ class LinkClearance:
 
 
 class ClearanceLimit(mink.Limit):
-    """Lets a gap shrink by at most a share of itself per step: gradient . dq <= gain gap.
+    """Limits how fast a gap may shrink, to a share of itself per step: gradient . dq <= gain gap.
 
-    A gap that is used up already may not shrink at all.
+    A gap that is already used up may not shrink at all.
 
     Attributes:
-        allowance_m: how much more than the gaps the links may use.
+        allowance_m: metres that the links may use beyond the gaps.
     """
 
     def __init__(

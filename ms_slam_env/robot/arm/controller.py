@@ -20,15 +20,15 @@ from ms_slam_env.robot.arm.feasibility import DAMPING, LIMIT_MARGIN_RAD
 from ms_slam_env.robot.arm.model import ArmModel
 
 REACHED_M, REACHED_RAD = 0.002, np.radians(0.2)
-"""Furthest that commanded poses may be from their path."""
+"""Largest deviation of commanded poses from their path."""
 
 CONTROL_HZ = 20.0
 """Rate at which the differential inverse kinematics is solved."""
 _SOLVED = 1  # exit flag of daqp
 _GAIN = 0.5  # share of a gap to furniture or to another link that one step may use up
-_LEEWAY_M = 0.002  # gaps are checked oftener here than by the mask
+_LEEWAY_M = 0.002  # because gaps are checked more often here than by the mask
 _NO_BOUND = 1e30  # daqp's infinity
-_CHECKS = 12  # of distances along a motion: about 1 cm apart
+_CHECKS = 12  # distance checks along a motion, about 1 cm apart
 _LATE_TICKS = 5  # added where joint speeds made the arm late
 
 
@@ -38,10 +38,11 @@ class Plan:
 
     Attributes:
         q: (k + 1, n) joint angles at the start and at the end of each tick.
-        tick_s: seconds a tick.
-        followed: the commanded camera keeps to its path and ends at the target, to 2 mm, 0.2 deg.
-        error_m: distance of the commanded camera to the target at the end.
-        error_rad: angle of the same.
+        tick_s: seconds per tick.
+        followed: whether the commanded camera keeps to its path and ends at the target, to 2 mm and
+            0.2 deg.
+        error_m: distance of the commanded camera from the target at the end.
+        error_rad: angle between the two.
     """
 
     q: Float64
@@ -61,9 +62,9 @@ class Controller:
 
     Each tick solves mink's quadratic programme for the pose at the tick's end: least squares of
     the pose's error subject to range and speed of the joints. If the links then come too close to
-    furniture or to each other, the motion is planned again with those limits in the programme; a
-    limit that does not bind does not change its solution, so the first plan stands where it is
-    legal.
+    furniture or to each other, the motion is planned again with those limits in the programme.
+    A limit that is not active does not change the solution, so a first plan without collision is
+    kept.
     """
 
     def __init__(
@@ -73,8 +74,8 @@ class Controller:
 
         Args:
             model: the arm.
-            chain: the model's, with what else its links must not touch.
-            clearance_field: furniture around it.
+            chain: the model's chain, plus other parts that its links must not touch.
+            clearance_field: distances to furniture around it.
             config: speeds, rate and clearance.
         """
         self._model = model
@@ -92,7 +93,7 @@ class Controller:
     def plan(self, q: Float64, T_base_target: Float64, least_duration_s: float = 0.0) -> Plan:
         """Plan a motion from rest at joint angles (n,) to a camera pose (4, 4).
 
-        It lasts as long as the camera's speed asks for, at least ``least_duration_s``.
+        Its duration follows from the camera's speed, and is at least ``least_duration_s``.
         """
         config = self._config
         path = CartesianPath(
@@ -144,8 +145,8 @@ class Controller:
     def _step(self, tick_s: float, limits: Sequence[mink.Limit]) -> Float64:
         """Change (nv,) of the model's coordinates during one tick: mink's programme, solved.
 
-        Range and speed of the joints are bounds of the variables, not rows, and daqp is called
-        directly: 0.06 ms, where mink's solve_ik with its limits of range and speed takes 0.2.
+        Joint range and speed are variable bounds rather than constraint rows, and daqp is called
+        directly: 0.06 ms, against 0.2 ms for mink's solve_ik with its range and speed limits.
         """
         configuration, model = self._configuration, self._model
         problem = mink.build_ik(configuration, [self._task], tick_s, DAMPING, limits)
@@ -159,13 +160,13 @@ class Controller:
             up = np.append(up, problem.h)
             down = np.concatenate([down, np.full(len(rows), -_NO_BOUND)])
         change, _, status, _ = daqp.solve(problem.P, problem.q, rows, up, down)
-        if status != _SOLVED:  # the limits leave no way to go: stay
+        if status != _SOLVED:  # no feasible step: stay
             return np.zeros(model.mj.nv)
         return np.asarray(change)
 
 
 def checked_ticks(ticks: int) -> NDArray[np.int64]:
-    """Of ticks 0 to ``ticks`` those at whose ends distances are checked, both ends included."""
+    """The ticks of 0 to ``ticks``, both included, at whose ends distances are checked."""
     return np.linspace(0, ticks, min(ticks, _CHECKS) + 1).round().astype(np.int64)
 
 

@@ -23,14 +23,14 @@ _SETTLE_S = 1.0  # before the first frame
 
 @dataclass(frozen=True)
 class Attempt:
-    """What came of a motion that was tried whatever the mask says.
+    """Result of a motion tried regardless of the mask.
 
     Attributes:
-        reached: the command kept to the camera's path and ended at the target, to 2 mm, 0.2 deg,
-            and nothing stopped the arm.
-        stopped: the arm came so close to furniture that it made a protective stop.
-        error_m: distance between where the camera ended and where it was commanded to.
-        error_rad: angle of the same.
+        reached: whether the command kept to the camera's path and ended at the target, to 2 mm and
+            0.2 deg, and nothing stopped the arm.
+        stopped: whether the arm came so close to furniture that it made a protective stop.
+        error_m: distance between the camera's final and commanded positions.
+        error_rad: angle between its final and commanded orientations.
         q: (t, n) joint angles of the links after every step of the physics.
     """
 
@@ -42,10 +42,10 @@ class Attempt:
 
 
 class DynamicArm(ArmEmbodiment):
-    """The arm with mass, servos and imperfections: what it really reaches is where the camera is.
+    """The arm with mass, servos and imperfections; the camera is where physics moves it.
 
-    Motions are planned from the commanded joint angles, so that sag and errors do not add up. The
-    kinematic pose is that of the joint sensors' readings.
+    Motions are planned from the commanded joint angles, so that sag and errors do not accumulate.
+    The kinematic pose follows from the joint sensors' readings.
 
     Attributes:
         q_command: (n,) joint angles that the servos hold.
@@ -65,7 +65,7 @@ class DynamicArm(ArmEmbodiment):
         self.start_at(self.model.home, np.random.default_rng(0))
 
     def stand_at(self, T_world_base: Float64) -> None:
-        """Move the base to a pose (4, 4) and look around from there."""
+        """Move the base to a pose (4, 4) and build the clearance field around it."""
         super().stand_at(T_world_base)
         self.controller = Controller(self.model, self.chain, self.clearance_field, self.config)
 
@@ -78,11 +78,11 @@ class DynamicArm(ArmEmbodiment):
 
     @property
     def T_world_camera_kinematic(self) -> Float64:
-        """(4, 4) the camera by the last readings of the joint sensors."""
+        """(4, 4) camera pose from the last readings of the joint sensors."""
         return self._kinematic
 
     def planning_state(self) -> tuple[Float64, Float64]:
-        """The commanded joint angles and the camera there."""
+        """The commanded joint angles and the camera pose at them."""
         return self.q_command, self.chain.camera_pose(self.q_command)
 
     def move(self, action: int) -> MotionResult:
@@ -95,9 +95,9 @@ class DynamicArm(ArmEmbodiment):
         return self._execute(plan)[0]
 
     def attempt(self, action: int) -> Attempt:
-        """Try motion ``action`` whatever the mask says, then take everything back.
+        """Try motion ``action`` regardless of the mask, then restore the state.
 
-        A motion that the mask forbids gets all the time that the mask would grant.
+        A masked motion gets the longest time that the mask would permit.
         """
         before, probe = self._moving_state(), self.probe()
         plan = self._plan(action, 1.0 if probe.ok[action] else MOST_STRETCH)
@@ -110,17 +110,17 @@ class DynamicArm(ArmEmbodiment):
         return Attempt(plan.followed and not stopped, stopped, error_m, error_rad, q_link)
 
     def get_state(self) -> dict[str, Any]:
-        """Where the arm stands, its physics, its errors and the state of its random numbers."""
+        """The base pose, the physics, the errors and the random generator's state."""
         return {"T_world_base": self.T_world_base.copy(), **self._moving_state()}
 
     def state_like(self) -> dict[str, Any]:
-        """A state in which the links have not been moved yet."""
+        """Template of a state in which the links have not moved yet."""
         like = self.get_state()
         like["imperfections"]["link"][:] = np.nan
         return like
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
+        """Resume from a state that ``get_state`` returned."""
         if not np.array_equal(self.T_world_base, state["T_world_base"]):
             self.stand_at(state["T_world_base"])
         self._restore(state)
@@ -133,8 +133,8 @@ class DynamicArm(ArmEmbodiment):
             return self.controller.plan(q, T_base_camera @ self.motions[action], least_s)
 
     def _execute(self, plan: Plan) -> tuple[MotionResult, bool, Float64]:
-        """Follow a plan; return what happened, whether the arm stopped to protect itself, and the
-        joint angles (t, n) of the links after every step."""
+        """Follow a plan; return the result, whether the arm made a protective stop, and the joint
+        angles (t, n) of the links after every step."""
         times = frame_times(plan.duration_s, self.config)
         with self.timings.stage("physics"):
             steps = np.maximum(1, np.round(times / self.dynamics.timestep_s).astype(np.int64))
@@ -169,8 +169,8 @@ class DynamicArm(ArmEmbodiment):
         return motion, self.imperfections.link_angles(motion.q)
 
     def _first_touch(self, plan: Plan, q_link: Float64) -> int | None:
-        """The first tick at whose end a link is within its radius of furniture, and nearer than
-        it was at the start; None if there is none."""
+        """The first tick that ends with a link within its radius of furniture, and nearer to it
+        than at the start; None if there is none."""
         ticks = checked_ticks(len(plan.q) - 1)[1:]
         if len(ticks) == 0:
             return None
@@ -192,7 +192,7 @@ class DynamicArm(ArmEmbodiment):
         self._settle_at(motion.q[-1:], q_link[-1:])
 
     def _settle_at(self, q_motor: Float64, q_link: Float64) -> tuple[Float64, Float64]:
-        """Be at the last of joint angles (k, n); the camera's poses (k, 4, 4), true and read."""
+        """Move to the last of joint angles (k, n); return true and read camera poses (k, 4, 4)."""
         readings = self.imperfections.readings(q_motor)
         both = self.T_world_base @ self.chain.camera_pose(np.stack([q_link, readings]))
         kinematic = both[1] @ self.imperfections.T_camera_assumed

@@ -1,4 +1,4 @@
-"""An arm's physics, and what keeps its camera from where its joint sensors say it is."""
+"""An arm's physics, and the imperfections between its true and measured camera pose."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _INPUTS = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIE
 
 @dataclass(frozen=True)
 class Motion:
-    """What physics made of a command, after each of ``t`` steps.
+    """Simulated response to a command, after each of ``t`` steps.
 
     Attributes:
         q: (t, n) joint angles.
-        velocity: (t, n) radians a second.
+        velocity: (t, n) radians per second.
         torque: (t, n) of the motors, Nm, gravity compensation included.
         energy_j: integral of |torque x velocity|, summed over the joints: mechanical work of
             motors that recover nothing.
@@ -38,11 +38,11 @@ class Motion:
 class ArmDynamics:
     """MuJoCo's simulation of an arm whose position servos follow a command.
 
-    The command is made smooth between ticks, and each servo gets its velocity too, as the servos
-    of industrial arms do: what is left are inertia, friction and the load that gravity
-    compensation does not know. All steps of a motion are one native call of MuJoCo's ``Batch``, a
-    fifth faster than stepping one by one; its state row is all there is to save. Each environment
-    has its own: several arms in one ``Batch`` cost as much on one thread as one after another.
+    The command is smoothed between ticks, and each servo also gets its velocity, as in industrial
+    arms. The remaining errors come from inertia, friction and the load that gravity compensation
+    does not model. All steps of a motion are one native call of MuJoCo's ``Batch``, a fifth faster
+    than single steps; its state row is the whole state. Each environment has its own ``Batch``:
+    several arms in one cost as much on one thread as one after another.
     """
 
     def __init__(self, model: ArmModel) -> None:
@@ -79,9 +79,9 @@ class ArmDynamics:
         """Step the arm along commanded joint angles.
 
         Args:
-            q_command: (k + 1, n) joint angles at the ends of k >= 0 ticks; the last are held after.
-            tick_s: seconds a tick.
-            steps: t >= 1 of physics.
+            q_command: (k + 1, n) joint angles at the ends of k >= 0 ticks; the last are then held.
+            tick_s: seconds per tick.
+            steps: t >= 1 physics steps.
             disturbance: (t, n) torque on the joints, Nm.
         """
         model, mj = self._model, self._model.mj
@@ -103,7 +103,7 @@ class ArmDynamics:
         return Motion(out["qpos"][0][:, model.qpos], speed, torque, energy)
 
     def _controls(self, q: Float64, velocity: Float64) -> Float64:
-        """Controls (t, n) at which the servos push nowhere at joint angles and velocities (t, n).
+        """Controls (t, n) at which the servos exert no force at joint states (t, n).
 
         MuJoCo's affine actuator: force = gain u + b0 + b1 gear q + b2 gear dq/dt.
         """
@@ -131,7 +131,7 @@ def smooth(q: Float64, tick_s: float, times: Float64) -> tuple[Float64, Float64]
 
 
 def _holding_controls(mj: mujoco.MjModel) -> Float64:
-    """Controls (nu,) that hold every joint with a position actuator where the model begins."""
+    """Controls (nu,) that hold every joint with a position actuator at its initial position."""
     controls = np.zeros(mj.nu)
     for actuator in range(mj.nu):
         b0, b1 = mj.actuator_biasprm[actuator, :2]
@@ -144,28 +144,26 @@ def _holding_controls(mj: mujoco.MjModel) -> Float64:
 
 
 VIBRATION_PERIOD_S = 0.01
-"""Torque noise is constant for so long: vibrations of up to 50 Hz."""
+"""Time for which torque noise is constant: vibrations of up to 50 Hz."""
 
 
 class Imperfections:
     """Backlash, vibration, sensor offsets and reading noise of one arm in one episode.
 
-    The joint sensors sit on the motors' side of the gears: they see neither backlash nor their own
-    zero offsets. All sizes are those of :class:`ArmNoise`; where they are zero, nothing is drawn
-    away from the exact value.
+    The joint sensors sit on the motor side of the gears: they see neither backlash nor their own
+    zero offsets. The sizes are those of :class:`ArmNoise`; where they are zero, values are exact.
 
     Attributes:
-        T_camera_assumed: (4, 4) hand-eye error: the camera where it is taken to be, in the true
-            camera's frame.
+        T_camera_assumed: (4, 4) hand-eye error: the assumed camera in the true camera's frame.
     """
 
     def __init__(self, noise: ArmNoise, torque_share: Float64, rng: np.random.Generator) -> None:
         """Draw an episode's errors.
 
         Args:
-            noise: their sizes.
+            noise: sizes of the errors.
             torque_share: (n,) greatest torque of each joint over the greatest of all.
-            rng: seeds the generator that is used from here on.
+            rng: seeds the generator used from then on.
         """
         self._noise = noise
         self._torque_share = torque_share
@@ -175,10 +173,10 @@ class Imperfections:
         turn = self._rng.normal(0.0, noise.hand_eye_rad, 3)
         self.T_camera_assumed = make_pose(so3_exp(turn), self._rng.normal(0.0, noise.hand_eye_m, 3))
         self._slack = 0.5 * noise.backlash_rad * self._rng.uniform(-1.0, 1.0, n)
-        self._link: Float64 | None = None  # joint angles of the links, once they have been moved
+        self._link: Float64 | None = None  # joint angles of the links, once they have moved
 
     def link_angles(self, q_motor: Float64) -> Float64:
-        """(t, n) joint angles of the links while the motors go through (t, n)."""
+        """(t, n) joint angles of the links while the motors move through (t, n)."""
         before = q_motor[0] + self._slack if self._link is None else self._link
         q = play(q_motor, before, 0.5 * self._noise.backlash_rad)
         self._link = q[-1].copy()
@@ -192,12 +190,12 @@ class Imperfections:
         return np.abs(speed_share) * self._torque_share * drawn[index]
 
     def readings(self, q_motor: Float64) -> Float64:
-        """(k, n) what the joint sensors read at joint angles (k, n)."""
+        """(k, n) readings of the joint sensors at joint angles (k, n)."""
         noise = self._rng.normal(0.0, self._noise.encoder_rad, q_motor.shape)
         return q_motor + self._offset + noise
 
     def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly."""
+        """Everything needed to resume bit-exactly."""
         return {
             "random": self._rng.bit_generator.state,
             "offset": self._offset.copy(),
@@ -207,7 +205,7 @@ class Imperfections:
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
+        """Resume from a state that ``get_state`` returned."""
         self._rng.bit_generator.state = state["random"]
         self._offset = state["offset"].copy()
         self.T_camera_assumed = state["T_camera_assumed"].copy()
@@ -218,9 +216,9 @@ class Imperfections:
 def play(x: Float64, start: Float64, half_width: float) -> Float64:
     """The play operator: outputs (t, n) of inputs (t, n), from outputs (n,) before the first.
 
-    y_k = min(max(y_{k-1}, x_k - r), x_k + r): the output stays until an edge of the play takes it
-    along (Krasnosel'skii and Pokrovskii, "Systems with Hysteresis", 1989). Steps of that kind are
-    clamps, and a clamp after a clamp is a clamp, so that all are composed in log2(t) passes.
+    y_k = min(max(y_{k-1}, x_k - r), x_k + r): the output stays until an edge of the play moves it
+    (Krasnosel'skii and Pokrovskii, "Systems with Hysteresis", 1989). Each step is a clamp, and
+    clamps compose to clamps, so all steps are composed in log2(t) passes.
     """
     low, high = x - half_width, x + half_width
     reach = 1

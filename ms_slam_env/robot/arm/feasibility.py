@@ -24,38 +24,38 @@ REASONS = ("ok", "unreachable", "joint limit", "joint speed", "furniture", "self
 """Words for ``FeasibilityResult.reason``."""
 
 FEWEST_PARTS = 7
-"""A path is cut into at least so many parts between waypoints."""
+"""Least number of parts into which a path is divided by waypoints."""
 
 LONGEST_PART_M = 0.022
 LONGEST_PART_RAD = np.radians(2.2)
-"""Longer paths into more, until the camera moves no more than this in each."""
+"""Longer paths get more parts, so that the camera moves no more than this in each."""
 
 MOST_STRETCH = 4.0
-"""A path on which a joint would take more than this times the camera's duration is refused,
-but for 15 %: what the controller makes good within its tolerance of the path, and in late ticks."""
+"""A path is refused if a joint would take more than this times the camera's duration, plus 15 %
+that the controller makes up within its path tolerance and in late ticks."""
 
 LIMIT_MARGIN_RAD = 0.02
 """Distance that planned and commanded joint angles keep from their limits."""
 
 DAMPING = 1e-5
-"""Weight of squared joint steps beside squared metres and radians of the camera's error: mask and
-controller minimise the same, so that they bend a redundant arm the same way."""
+"""Weight of squared joint steps against the camera's squared error in metres and radians. Mask and
+controller minimise the same sum, so that they bend a redundant arm the same way."""
 
 _LEEWAY = 0.15
-_STILL_S = 1e-6  # duration given to a path without motion
+_STILL_S = 1e-6  # duration assigned to a path without motion
 
 
 @dataclass(frozen=True)
 class FeasibilityResult:
-    """What became of ``k`` paths.
+    """Feasibility of ``k`` paths.
 
     Attributes:
-        ok: (k,) the arm can make the motion.
+        ok: (k,) whether the arm can make the motion.
         reason: (k,) index into ``REASONS``; 0 where ok.
         q: (k, W, n) joint angles after equal parts of the duration, the first at the start of the
-            path, the last at its end; only the start is sure to be there if the motion is not ok.
-        duration_s: (k,) of the motion; longer than the camera's own where a joint needs longer;
-            0 without motion.
+            path, the last at its end; only the start is valid if the motion is not ok.
+        duration_s: (k,) duration of the motion, longer than the camera's where a joint needs
+            longer; 0 without motion.
     """
 
     ok: NDArray[np.bool_]
@@ -65,23 +65,23 @@ class FeasibilityResult:
 
 
 class Feasibility:
-    """Follows Cartesian paths of the camera with the joints and says which are possible.
+    """Follows Cartesian paths of the camera with the joints, and decides which are possible.
 
-    A path is possible if at each of its waypoints inverse kinematics between the joints' limits
-    finds joint angles within 1.8 mm and 0.18 degrees of it (the controller allows itself 2 mm and
-    0.2), capsules around the links stay ``clearance_m`` away from furniture (beyond the slack of
+    A path is possible if at each of its waypoints inverse kinematics within the joint limits finds
+    joint angles within 1.8 mm and 0.18 degrees of it (the controller allows itself 2 mm and 0.2),
+    capsules around the links stay ``clearance_m`` away from furniture (beyond the slack of
     ``ClearanceField``) and from each other, and no joint needs more than ``MOST_STRETCH`` times the
-    duration of the camera's path. Of the joint angles that an arm with spare joints has for a
-    waypoint, those nearest to the waypoint before are taken: spare joints bend around limits as in
-    the controller, but not around furniture or other links as there, so that a few motions are
-    refused that it could make.
-    Distances are checked at places so close that no link moves more than 4 cm between two, half of
+    duration of the camera's path. If an arm with spare joints has several solutions for a waypoint,
+    the one nearest to the waypoint before is taken. Spare joints avoid limits as in the controller,
+    but unlike there not furniture or other links, so that a few possible motions are refused.
+
+    Distances are checked so often that no link moves more than 4 cm between two checks, half of
     which the clearance covers.
+
     Pairs of links that are closer than the clearance at the arm's home need half that gap.
 
-    An arm that stands too close already, by less than the clearance, may go on, though not closer:
-    a pose reached with a small error must not be a trap. The motion that stands still is always
-    possible.
+    An arm already too close, by less than the clearance, may move, but not closer: a pose reached
+    with a small error must not be a trap. Standing still is always possible.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class Feasibility:
 
 
 def _parts(step: Float64, turn: Float64) -> int:
-    """How many parts the longest of paths with translations and rotations (k, 3) needs."""
+    """Number of parts needed by the longest of paths with translations and rotations (k, 3)."""
     metres = np.linalg.norm(step, axis=1).max(initial=0.0) / LONGEST_PART_M
     radians = np.linalg.norm(turn, axis=1).max(initial=0.0) / LONGEST_PART_RAD
     return max(FEWEST_PARTS, int(np.ceil(PEAK_SPEED * max(metres, radians) - 1e-6)))
@@ -203,7 +203,7 @@ class _Buffers:
 
 @lru_cache(maxsize=16)
 def _arm(chain: Chain, clearance_m: float, device: str) -> Arm:
-    """The chain for the kernel: joint frames turned so that their z axes are the joints' axes."""
+    """The chain for the kernel, with joint frames rotated so that z is the joint axis."""
     turns = [np.eye(4)] + [_turn_to_z(axis) for axis in chain.axes]  # link frame <- turned frame
     fixed = [*chain.T_parent_joint, chain.T_last_camera]
     after = [*turns[1:], np.eye(4)]

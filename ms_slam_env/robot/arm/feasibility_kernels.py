@@ -33,7 +33,7 @@ class Grid:
 
 @wp.func
 def why_missed(arm: Arm, q: wp.array3d[float], k: int, w: int, work: Scratch) -> int:
-    """The reason why a waypoint is not reached: a joint at its limit, or else the distance."""
+    """Why a waypoint is not reached: a joint at its limit, or else out of reach."""
     found = int(UNREACHABLE)
     for i in range(arm.num_joints):
         if q[k, w, i] <= work.low[k, i] + _AT_LIMIT or q[k, w, i] >= work.high[k, i] - _AT_LIMIT:
@@ -72,13 +72,13 @@ def distance_at(grid: Grid, point: wp.vec3) -> float:
 
 @wp.func
 def furniture_deficit(arm: Arm, grid: Grid, k: int, work: Scratch) -> float:
-    """Metres by which the moving links come closer to furniture than they may; <= 0 if none."""
+    """Metres by which the moving links violate their clearance to furniture; <= 0 if none."""
     worst = float(-1.0e6)
     for i in range(arm.capsule_link.shape[0]):
         if arm.capsule_link[i] > 0:
             a = work.a[k, i]
             b = work.b[k, i]
-            # far from everything in the middle is far enough all along
+            # enough distance in the middle implies enough all along
             spare = distance_at(grid, 0.5 * (a + b)) - 0.5 * wp.length(b - a)
             if spare >= arm.capsule_need[i]:
                 worst = wp.max(worst, arm.capsule_need[i] - spare)
@@ -114,7 +114,7 @@ def segment_distance(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3) -> floa
 
 @wp.func
 def self_deficit(arm: Arm, k: int, work: Scratch) -> float:
-    """Metres by which two links come closer than they may; <= 0 if none do."""
+    """Metres by which two links violate their clearance to each other; <= 0 if none."""
     worst = float(-1.0e6)
     for i in range(arm.pair.shape[0]):
         pair = arm.pair[i]
@@ -132,7 +132,7 @@ def self_deficit(arm: Arm, k: int, work: Scratch) -> float:
 
 @wp.func
 def place_capsules(arm: Arm, k: int, work: Scratch) -> float:
-    """Ends of the capsules in the base frame, from the links' poses; how far the farthest moved."""
+    """Place the capsules in the base frame from the links' poses; return the largest movement."""
     farthest = float(0.0)
     for i in range(arm.capsule_link.shape[0]):
         link = arm.capsule_link[i]
@@ -149,7 +149,7 @@ def place_capsules(arm: Arm, k: int, work: Scratch) -> float:
 
 @wp.func
 def collision(arm: Arm, grid: Grid, k: int, work: Scratch, deficit: wp.array[float]) -> int:
-    """The reason against the capsules where they are now, or ``OK``."""
+    """The collision of the capsules at their present place, or ``OK``."""
     if furniture_deficit(arm, grid, k, work) > deficit[0]:
         return FURNITURE
     if self_deficit(arm, k, work) > deficit[1]:
@@ -167,9 +167,9 @@ def collision_on_part(
     work: Scratch,
     deficit: wp.array[float],
 ) -> int:
-    """The reason against the part that ends at waypoint ``w``, or ``OK``.
+    """The collision on the part that ends at waypoint ``w``, or ``OK``.
 
-    Where a link moves far between two waypoints places between them are checked too.
+    Where a link moves far between two waypoints, poses between them are checked too.
     """
     moved = place_capsules(arm, k, work)
     found = collision(arm, grid, k, work, deficit)
@@ -182,7 +182,7 @@ def collision_on_part(
             forward(arm, work.q, k, 0, work)
             place_capsules(arm, k, work)
             found = collision(arm, grid, k, work, deficit)
-    if checks > 1 and found == OK:  # back to the waypoint, from where the next part begins
+    if checks > 1 and found == OK:  # back to the waypoint, where the next part begins
         forward(arm, q, k, w, work)
         place_capsules(arm, k, work)
     return found
@@ -197,7 +197,7 @@ def start_deficits(
     most: float,
     deficit: wp.array[float],
 ) -> None:
-    """How much closer to furniture and to itself the arm may come because it already is."""
+    """Violations of clearance at the start, which the arm may keep on its path."""
     forward(arm, q, 0, 0, work)
     place_capsules(arm, 0, work)
     deficit[0] = wp.clamp(furniture_deficit(arm, grid, 0, work), 0.0, most)
@@ -225,7 +225,7 @@ def follow(
 ) -> None:
     """Follow one candidate's path; ``q`` (k, W, n) holds the start in its first waypoint.
 
-    ``share`` (W,) is how much of the path is made at each waypoint.
+    ``share`` (W,) is the share of the path completed at each waypoint.
     """
     k = wp.tid()
     n = arm.num_joints
@@ -233,13 +233,13 @@ def follow(
     angle = wp.length(turn[k])
     axis = wp.normalize(turn[k])
     slowest = float(1.0)
-    for i in range(n):  # who starts beyond a limit's margin may stay there
+    for i in range(n):  # a joint that starts beyond its limit's margin may stay there
         work.low[k, i] = wp.min(arm.lower[i] + limit_margin, q[k, 0, i])
         work.high[k, i] = wp.max(arm.upper[i] - limit_margin, q[k, 0, i])
     forward(arm, q, k, 0, work)
     place_capsules(arm, k, work)
     for w in range(1, parts + 1):
-        for i in range(n):  # straight on in joint space is a close first guess
+        for i in range(n):  # extrapolation in joint space is a close first guess
             q[k, w, i] = q[k, w - 1, i]
             if w > 1:
                 ahead = (share[w] - share[w - 1]) / (share[w - 1] - share[w - 2])

@@ -2,8 +2,8 @@
 # Warp code: int(0) declares a variable that changes.
 """Inverse kinematics on the device: from one waypoint to the next, within the joints' limits.
 
-Joint axes are the z axes of the joint frames here. Joint angles and axes live in arrays of one row
-a candidate ``k``.
+Joint axes are the z axes of the joint frames here. Joint angles and axes are in arrays with one row
+per candidate ``k``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Arm:
     capsule_link: wp.array[int]  # (m,) 0 is the base
     capsule_a: wp.array[wp.vec3]  # (m,)
     capsule_b: wp.array[wp.vec3]  # (m,)
-    capsule_parts: wp.array[int]  # (m,) pieces that its axis is cut into
+    capsule_parts: wp.array[int]  # (m,) pieces into which its axis is cut
     capsule_need: wp.array[float]  # (m,) distance of the axis to furniture
     capsule_cover: wp.array[float]  # (m,) the same for the balls that cover it
     pair: wp.array[wp.vec2i]  # (p,)
@@ -132,9 +132,9 @@ def bounded_step(
 ) -> None:
     """Newton step that stays between ``work.low`` and ``work.high``, in ``work.step``.
 
-    Least squares of the pose's error plus ``damping`` times those of the path from the waypoint
-    before: the controller's quadratic programme. Joints that would leave their bounds are held
-    there, and the others bend around them, until no more leave.
+    Solves the controller's quadratic programme: the squared pose error plus ``damping`` times the
+    squared path from the waypoint before. Joints that would leave their bounds are held there and
+    the others compensate, until none leaves.
     """
     n = arm.num_joints
     for i in range(n):
@@ -175,14 +175,14 @@ def solve_waypoint(
     w: int,
     work: Scratch,
 ) -> int:
-    """One Newton step or more from the guess in ``q``; whether the camera is within tolerance."""
+    """Take Newton steps from the guess in ``q``; return whether the camera is within tolerance."""
     n = arm.num_joints
     close = int(0)
     for iteration in range(_ITERATIONS):
         forward(arm, q, k, w, work)
         E = R_target * wp.transpose(work.R[k, n + 1])
         dt = t_target - work.t[k, n + 1]
-        # the rotation vector to first order: what is left of it shrinks with every step
+        # the rotation vector to first order, whose error shrinks with every step
         dr = 0.5 * wp.vec3(E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1])
         off_m = wp.length(dt)
         off_rad = wp.length(dr)

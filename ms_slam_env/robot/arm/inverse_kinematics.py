@@ -21,10 +21,10 @@ _DAMPING = 1e-3  # of the pseudo-inverse, metres and radians
 _LARGEST_STEP_RAD = 0.5
 
 LIMIT_MARGIN_RAD = 0.15
-"""Distance that a posture keeps from joint limits, so that motions are left on both sides."""
+"""Distance that a posture keeps from joint limits, so that it can move both ways."""
 
 STEP_M, STEP_RAD = 0.12, np.radians(12)
-"""Motions that a posture is judged by."""
+"""Size of the motions by which a posture is rated."""
 
 PITCHES = np.linspace(-np.pi / 2, np.pi / 2, 19)
 """Pitches of the camera, from straight down to straight up, for which postures are kept."""
@@ -40,19 +40,19 @@ _AT_ONCE = 256
 
 @dataclass(frozen=True)
 class Solutions:
-    """Joint angles (s, n) and how far the camera is from its target there, (s,) each."""
+    """Joint angles (s, n), and the camera's distance and angle from its target, (s,) each."""
 
     q: Float64
     error_m: Float64
     error_rad: Float64
 
     def accurate(self, tolerance_m: float = 1e-6, tolerance_rad: float = 1e-6) -> NDArray[np.bool_]:
-        """(s,) which of them put the camera on the target."""
+        """(s,) which solutions put the camera on the target."""
         return (self.error_m < tolerance_m) & (self.error_rad < tolerance_rad)
 
 
 def solve_pose(chain: Chain, q: Float64, T_base_camera: Float64, iterations: int = 30) -> Solutions:
-    """Bring the camera to a pose (4, 4) from joint angles (s, n), whatever the joint limits."""
+    """Bring the camera to a pose (4, 4) from joint angles (s, n), ignoring joint limits."""
 
     def task(angles: Float64) -> tuple[Float64, Float64]:
         return _twist(chain.camera_pose(angles), T_base_camera), chain.camera_jacobian(angles)
@@ -74,17 +74,17 @@ def _damped_newton(
     tolerance: float,
     shorten: Callable[[Float64], Float64],
 ) -> tuple[Float64, Float64]:
-    """Joint angles (s, n) after damped Newton steps from some, and what is left of the error.
+    """Joint angles (s, n) after damped Newton steps, and the remaining error.
 
     Wampler, "Manipulator inverse kinematic solutions based on vector formulations and damped
     least-squares methods" (1986), equation (10).
 
     Args:
-        task: error (s, e) of joint angles (s, n), and how they lessen it: Jacobian (s, e, n).
-        q: (s, n) where to begin.
-        iterations: steps at most.
-        tolerance: of every number of the error, below which no more are made.
-        shorten: makes steps (s, n) no longer than linearisation allows.
+        task: returns the error (s, e) of joint angles (s, n), and its Jacobian (s, e, n).
+        q: (s, n) joint angles to start from.
+        iterations: most steps.
+        tolerance: largest error component at which iteration stops.
+        shorten: shortens steps (s, n) to what linearisation allows.
     """
     angles = np.array(q, dtype=np.float64)
     for _ in range(iterations):
@@ -111,7 +111,7 @@ class IKSeeds:
 
     Attributes:
         q: (l, n) joint angles; the camera has that pitch and no roll, the base is upright.
-        motions: (l,) how many of the 49 motions the arm can make there where nothing else is.
+        motions: (l,) number of the 49 motions that are possible there in an empty world.
     """
 
     q: Float64
@@ -120,7 +120,7 @@ class IKSeeds:
 
 @dataclass(frozen=True)
 class Samples:
-    """Joint angles (s, n) all over an arm's range, and what is known of them.
+    """Joint angles (s, n) from an arm's whole range, with their camera poses and efforts.
 
     Attributes:
         q: (s, n).
@@ -156,11 +156,11 @@ def sample_joints(chain: Chain, home: tuple[float, ...], config: ArmConfig) -> S
 def ik_seeds_at(
     chain: Chain, home: tuple[float, ...], config: ArmConfig, pitch_index: int
 ) -> IKSeeds:
-    """Search for postures with the camera at one of ``PITCHES`` and upright.
+    """Search for postures with the camera at one of ``PITCHES``, without roll.
 
-    Random joint angles are turned until the camera has that pitch and no roll. Of those that leave
-    joints and links room, the ones of least effort with bases at different places, as seen from
-    the camera, are kept, and their motions counted.
+    Random joint angles are adjusted until the camera has that pitch and no roll. Of those within
+    joint limits and with links apart, the ones with the least effort and different base positions
+    relative to the camera are kept, and their possible motions counted.
     """
     samples = sample_joints(chain, home, config)
     pitch = PITCHES[pitch_index]
@@ -184,14 +184,14 @@ def _count_motions(chain: Chain, feasibility: Feasibility, q: Float64) -> int:
 
 
 def effort(chain: Chain, q: Float64, speed_m_s: float, speed_rad_s: float) -> Float64:
-    """(s,) how hard the joints at (s, n) work, on average over the 49 motions of the camera.
+    """(s,) effort of the joints at (s, n), averaged over the 49 motions of the camera.
 
-    For each motion the greatest ratio of needed to permitted joint speed, by the damped inverse of
-    the Jacobian where the motion begins, at least 1 (the joints are fast enough) and at most 4
-    (too slow, or out of control).
+    The effort of a motion is the greatest ratio of needed to permitted joint speed, from the damped
+    inverse of the Jacobian where the motion begins, clipped to at least 1 (the joints are fast
+    enough) and at most 4 (too slow, or out of control).
     """
     rates = _camera_rates(speed_m_s, speed_rad_s)
-    # few at a time stay in the processor's cache, which is faster
+    # small batches stay in the processor's cache
     some = [_effort(chain, q[i : i + _AT_ONCE], rates) for i in range(0, len(q), _AT_ONCE)]
     return np.concatenate([np.zeros(0), *some])
 
@@ -229,7 +229,7 @@ def turn_upright(
     """Turn joints (s, n) until the base's z axis is ``up`` (3,) in the camera's frame.
 
     Returns:
-        Joint angles (s, n), and (s,) whether they do it to 1e-9.
+        Joint angles (s, n), and (s,) whether they are upright to 1e-9.
     """
     angles, error = _damped_newton(
         lambda angles: _uprightness(chain, angles, up),
@@ -261,7 +261,7 @@ def links_apart(chain: Chain, q: Float64) -> NDArray[np.bool_]:
 
 
 def wrap_joints(chain: Chain, q: Float64) -> Float64:
-    """Joint angles (s, n) moved by whole turns towards the middle of their limits."""
+    """Shift joint angles (s, n) by whole turns towards the middle of their limits."""
     limited = np.isfinite(chain.lower) & np.isfinite(chain.upper)
     low, high = np.where(limited, chain.lower, 0.0), np.where(limited, chain.upper, 0.0)
     middle = 0.5 * (low + high)
@@ -269,7 +269,7 @@ def wrap_joints(chain: Chain, q: Float64) -> Float64:
 
 
 def _spread(chain: Chain, q: Float64) -> Float64:
-    """Up to ``_KEPT`` of postures (s, n), the first preferred, with bases apart."""
+    """Up to ``_KEPT`` of postures (s, n) with bases apart, preferring the first."""
     R_t = chain.camera_pose(q)
     base = -np.einsum("sji,sj->si", R_t[:, :3, :3], R_t[:, :3, 3])
     free = np.ones(len(q), dtype=bool)

@@ -1,4 +1,4 @@
-"""An arm read from an MJCF file: MuJoCo's model of it and the chain that leads to the camera."""
+"""Load an arm from an MJCF file: MuJoCo's model and the chain that leads to the camera."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _ROBOT = re.compile(r"<robot[\s>]")  # root of a URDF
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """MuJoCo's model and what the planner needs of it; shared, never changed.
+    """MuJoCo's model and the parts that the planner needs; shared, never changed.
 
     Attributes:
         path: the MJCF file.
@@ -60,12 +60,12 @@ def load_arm(model: str, camera_site: str = "camera", joint_speed_rad_s: float =
 
     The file needs a site ``camera_site`` with the axes of a camera (x right, y down, z forward)
     that hinges lead to, each with a position actuator and no other joint between. A ``<custom>``
-    numeric ``joint_speed`` gives the greatest speeds of the joints in radians a second,
-    ``joint_speed_rad_s`` holds where it is missing. Joints beside the chain keep their initial
-    place.
+    numeric ``joint_speed`` gives the greatest speeds of the joints in radians per second;
+    ``joint_speed_rad_s`` applies where it is missing. Joints outside the chain keep their initial
+    position.
 
     Raises:
-        InputError: no such file, not an MJCF, no such site, or joints that make no serial arm.
+        InputError: no such file, not an MJCF, no such site, or joints that are not a serial arm.
     """
     path = ARM_MODELS.get(model, Path(model))
     mj = _compile(model, path)
@@ -110,13 +110,13 @@ def _compile(model: str, path: Path) -> mujoco.MjModel:
 
 
 def _checked_text(path: Path) -> str:
-    """The text of a model, after a look at the files that it and what it includes may name.
+    """Read a model's text, and check the files that it and its includes may name.
 
-    MuJoCo opens these itself, and would read a pipe for ever. Comments and folders of other assets
-    are looked at, too.
+    MuJoCo opens these itself, and would wait for ever on a pipe. Names in comments and in folders
+    of other assets are also checked.
 
     Raises:
-        InputError: one that is no regular file, or too large.
+        InputError: one of the files is not a regular file, or is too large.
     """
     texts: list[str] = []
     names: set[str] = set()
@@ -142,7 +142,7 @@ def _checked_text(path: Path) -> str:
 
 
 def _no_site(mj: mujoco.MjModel, wanted: str, path: Path) -> InputError:
-    """Why an arm has no camera, and how it gets one."""
+    """The error for an arm without a camera site, with the remedy."""
     sites = [mj.site(i).name for i in range(mj.nsite)]
     choose = "set arm.camera_site to one of them, or " if sites else ""
     cameras = "its <camera> elements do not count: " if mj.ncam else ""
@@ -154,7 +154,7 @@ def _no_site(mj: mujoco.MjModel, wanted: str, path: Path) -> InputError:
 
 
 def _joints_to(mj: mujoco.MjModel, body: int, path: Path) -> Int32:
-    """Ids of the hinges on the way from the world to ``body``, in that order."""
+    """Ids of the hinges from the world to ``body``, in that order."""
     joints: list[int] = []
     while body > 0:
         first, count = int(mj.body_jntadr[body]), int(mj.body_jntnum[body])

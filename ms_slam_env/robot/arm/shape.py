@@ -15,7 +15,7 @@ from ms_slam_env.robot.arm.model import ArmModel
 
 _COLUMN_RGB = (0.62, 0.63, 0.65)
 _FOOT_HEIGHT_M = 0.02
-_SLENDER = 0.6  # radius of the column drawn, in units of the one that is kept free
+_SLENDER = 0.6  # radius of the drawn column, as a share of the one kept free
 _SECTIONS = 48
 
 
@@ -50,7 +50,7 @@ def arm_parts(model: ArmModel, q: Float64, T_world_base: Float64) -> list[Part]:
 
 @lru_cache(maxsize=8)
 def _geoms(model: ArmModel) -> list[tuple[int, Part]]:
-    """Number and surface, in its own frame, of every geom that is seen."""
+    """Index and surface, in its own frame, of every visible geom."""
     mj = model.mj
     found = []
     for geom in range(mj.ngeom):
@@ -63,7 +63,7 @@ def _geoms(model: ArmModel) -> list[tuple[int, Part]]:
 
 
 def surface_dots(parts: list[Part], spacing_m: float) -> tuple[Float64, Float64, Float64]:
-    """Points (N, 3) all over some parts, about so far apart, with normals and colours (N, 3)."""
+    """Points (N, 3) on some parts, about ``spacing_m`` apart, with normals and colours (N, 3)."""
     points, normals, colours = [], [], []
     for part in parts:
         a, b, c = np.moveaxis(part.corners, 1, 0)
@@ -71,7 +71,7 @@ def surface_dots(parts: list[Part], spacing_m: float) -> tuple[Float64, Float64,
         reached = np.cumsum(area)
         count = int(np.ceil(reached[-1] / spacing_m**2))
         face = np.searchsorted(reached, (np.arange(count) + 0.5) * reached[-1] / count)
-        # Halton's sequence: even without a pattern, and the same every time
+        # Halton sequence: even, without a pattern, and reproducible
         u, v = (_halton(count, base) for base in (2, 3))
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
         weights = np.stack([1 - u - v, u, v], axis=1)[:, :, None]
