@@ -232,7 +232,7 @@ def judge_consistency(
         points: (N, 3) of the map, world frame, evenly spread (one a voxel), so that a surface
             counts by its area.
         votes: (N, L) how many views saw each point on each object, see
-            :func:`ms_slam_env.metrics.consistency.count_votes`.
+            :func:`count_votes`.
         surface: (M, 3) of the true surface.
         surface_labels: (M,) object of each true point.
         rule: the thresholds.

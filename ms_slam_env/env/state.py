@@ -1,6 +1,6 @@
 """Check the parts and the episode of a saved state before anything changes.
 
-The remaining parts are compared with fresh ones in ``slam.state_check``.
+The remaining parts are compared with fresh ones in ``slam.shared.state_check``.
 """
 
 from __future__ import annotations

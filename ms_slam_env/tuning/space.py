@@ -89,7 +89,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "kinectfusion": (*_KINECT_FUSION, "iterations.0", "iterations.1", "iterations.2"),
 }
 """Names that stand for several parameters; those that a machine or a backend has not are left out
-of ``compiler`` and ``machine`` (``availability.why_absent``)."""
+of ``compiler`` and ``machine`` (``why_absent``)."""
 
 _OF_CONFIGURATION = ("image_size", "keep_every", "threads", "cpu_mhz")
 _LEVELS = "pyramid_levels"

@@ -1,4 +1,4 @@
-"""Planners know what the robot knows: none of ours touches the truth, none can reach it."""
+"""Planners know what the robot knows: none of ours touches the truth."""
 
 from __future__ import annotations
 

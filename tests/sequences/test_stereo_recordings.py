@@ -184,6 +184,9 @@ def test_faults_of_kitti_are_named(kitti, tmp_path):
             with pytest.raises(InputError, match=complaint):
                 open_recording(kitti)
             (kitti / name).write_text(texts[name])
+    (kitti / "calib.txt").write_text(",\n" + texts["calib.txt"])  # a line without a word
+    open_recording(kitti)
+    (kitti / "calib.txt").write_text(texts["calib.txt"])
     with pytest.raises(InputError, match="calibration of KITTI is that of its calib"):
         open_recording(kitti, intrinsics=K)
     swapped = tmp_path / "swapped"

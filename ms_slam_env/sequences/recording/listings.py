@@ -39,13 +39,15 @@ class Listed:
 
 
 def rows(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield (``file:line``, words) of every line that is neither empty nor a comment.
+    """Yield (``file:line``, words) of every line that has any and is no comment.
 
     Raises:
         InputError: the file cannot be read.
     """
     for where, line in _lines(path):
-        yield where, words_of(line)
+        words = words_of(line)
+        if words:  # a line of separators has none
+            yield where, words
 
 
 def _lines(path: Path, comments: list[str] | None = None) -> Iterator[tuple[str, str]]:
