@@ -38,8 +38,9 @@ def without_truth(info: dict[str, Any]) -> dict[str, Any]:
 class RobotView:
     """The robot's knowledge of the episode so far; planners see nothing else.
 
-    Poses are in SLAM's world frame, which begins at the true start pose. No public attribute leads to
-    the environment, the scene or a true pose: a convention, not a wall. Do not write to the arrays.
+    Poses are in SLAM's world frame, which begins at the true start pose. No public attribute
+    leads to the environment, the scene or a true pose: a convention, not a wall. Do not write to
+    the arrays.
 
     Args:
         env: the unwrapped environment.

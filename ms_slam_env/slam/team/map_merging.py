@@ -1,9 +1,9 @@
 """Where two robots' maps lie relative to each other, found from what both saw, or refused.
 
 Every robot's SLAM has a frame of its own. Frames of one robot give guesses of where its map lies in
-the map of the other (:mod:`.relative_map_poses`): by points that look alike, and by relocalising them
-there. A pose that enough of them agree on is refined by registration of the maps, and believed if
-the images of either robot look like the view that the other's map predicts.
+the map of the other (:mod:`.relative_map_poses`): by points that look alike, and by relocalising
+them there. A pose that enough of them agree on is refined by registration of the maps, and
+believed if the images of either robot look like the view that the other's map predicts.
 """
 
 from __future__ import annotations
