@@ -1,4 +1,4 @@
-"""What all experiments share: finding, running, checking and writing them."""
+"""Find, run, check and write experiments."""
 
 from ms_slam_env.benchmark.experiment import (
     EXPERIMENTS,

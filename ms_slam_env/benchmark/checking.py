@@ -1,4 +1,4 @@
-"""Are committed results what the code makes today? Some of their rows are run again."""
+"""Check committed results by running some of their rows again with today's code."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from ms_slam_env.report.results import Results
 from ms_slam_env.report.tables import finished
 
 TOLERANCE = 0.02
-"""Relative difference that other processors cause: rounding of the last bits, amplified."""
+"""Relative difference expected between processors: amplified rounding of the last bits."""
 _SMALLEST = 1e-6
 _OTHERS_CODE = re.compile(r"(?!ms_slam_(env|baselines|agents)\b)[A-Za-z_][\w.]*:[A-Za-z_]")
-"""As ``module:Class``; a sequence, ``scene:seed``, goes on with a digit."""
+"""Matches ``module:Class``, but not a sequence ``scene:seed``, which has a digit there."""
 
 
 def check_results(cls: type[Experiment], committed: Results) -> tuple[int, list[str]]:
-    """Run some committed rows again; how many, and one line for each value that differs.
+    """Run some committed rows again; return their count and a line for each value that differs.
 
-    The cheapest row is taken for each value of the first field of the specifications (planners,
-    say). Only metrics that the registry calls repeatable are compared.
+    The rows are the cheapest for each value of the specification's first field (such as the
+    planner). Only metrics that the registry marks as repeatable are compared.
 
     Raises:
-        InputError: no finished rows, results of another experiment, or rows that the experiment
-            has no specification for.
+        InputError: no finished rows, results of another experiment, or rows that do not fit the
+            experiment's specification.
     """
     name = cls.__module__.rpartition(".")[2]
     if committed.kind != name:
@@ -59,10 +59,10 @@ def check_results(cls: type[Experiment], committed: Results) -> tuple[int, list[
 
 
 def _check_is_ours(spec: Mapping[str, Any]) -> None:
-    """Refuse a specification that names a program, or code that does not come with the package.
+    """Refuse a specification that names a program, or code from outside the package.
 
     Raises:
-        InputError: naming it.
+        InputError: names the program or the code.
     """
     for key, value in spec.items():
         for text in value if isinstance(value, (list, tuple)) else (value,):
@@ -75,13 +75,13 @@ def _check_is_ours(spec: Mapping[str, Any]) -> None:
 
 
 def spec_type(cls: type[Experiment]) -> type[Any]:
-    """The dataclass that ``run`` takes."""
+    """Return the type of the specification that ``run`` takes."""
     (hint, *_) = typing.get_type_hints(cls.run).values()
     return hint
 
 
 def compare(before: Any, after: Any, where: str = "") -> list[str]:
-    """What differs between two results beyond ``TOLERANCE``, at any depth, one line a value."""
+    """List the values that differ by more than ``TOLERANCE``, at any depth, one line each."""
     if isinstance(before, Mapping) and isinstance(after, Mapping):
         kept = {key: old for key, old in before.items() if metric(key).repeatable}
         missing = [f"{where}{key} is missing" for key in kept if key not in after]
@@ -102,9 +102,9 @@ def _alike(old: Any, new: Any) -> bool:
     return bool(old == new)
 
 
-_FOLDERS = {"planners": "room_task"}  # that are not called as the experiment is
+_FOLDERS = {"planners": "room_task"}  # folders not named after their experiment
 
 
 def committed_results(name: str) -> Path:
-    """Where the results of an experiment are committed, seen from the root of a clone."""
+    """Return the folder of an experiment's committed results, relative to the root of a clone."""
     return Path("docs") / "results" / _FOLDERS.get(name, name)

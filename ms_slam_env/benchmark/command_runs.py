@@ -1,8 +1,8 @@
-"""A SLAM system outside of this package, run by a command line over the frames of a sequence.
+"""Run an external SLAM system as a command line over the frames of a sequence.
 
-The command is what the user types after ``--backends command:``, nowhere else: no file of results,
-configurations or studies is asked for one (SECURITY.md). It is split as a shell would split it, but
-no shell sees it, and the frames stand in a folder without true poses.
+The command comes only from what the user types after ``--backends command:``, never from a file of
+results, configurations or studies (SECURITY.md). It is split like a shell command, but no shell
+runs it. The system reads the frames from a folder without true poses.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from ms_slam_env.sequences.writing import write_frames
 
 PREFIX = "command:"
 SEQUENCE, TRAJECTORY = "{sequence}", "{trajectory}"
-_LAST_WORDS = 200  # characters of what a program said before it failed
+_LAST_WORDS = 200  # characters kept of the output of a program that failed
 
 
 @dataclass(frozen=True)
 class CommandCost:
-    """What a program took for a whole sequence, its start and its reading of images included.
+    """Cost of a program for a whole sequence, including its start and its reading of images.
 
     Attributes:
-        ext_s: by the clock.
-        cpu_s: processor time of it and of what it started and waited for.
+        ext_s: wall-clock time.
+        cpu_s: processor time of the program and of the child processes that it waited for.
     """
 
     ext_s: float
@@ -47,31 +47,30 @@ class CommandCost:
 
 
 _NAMED = re.compile(rf"(?:([^=,:]+)=)?({PREFIX}.*)", re.DOTALL)
-"""``command:PROGRAM ...``, a name in front of it or not."""
+"""Matches ``[NAME=]command:PROGRAM ...``."""
 
 
 def is_command(backend: str) -> bool:
-    """Whether a backend is a command line, ``[NAME=]command:PROGRAM ...``."""
+    """Tell whether a backend is a command line, ``[NAME=]command:PROGRAM ...``."""
     return _NAMED.fullmatch(backend) is not None
 
 
 def name_of(backend: str) -> str:
-    """What tables call a backend: of ``NAME=command:...`` NAME, of others all that was given."""
+    """Return a backend's name in tables: NAME of ``NAME=command:...``, else the whole text."""
     found = _NAMED.fullmatch(backend)
     return found[1] if found and found[1] else backend
 
 
 def command_of(backend: str) -> str:
-    """``command:PROGRAM ...`` without its name."""
+    """Return ``command:PROGRAM ...`` without the name in front of it."""
     return backend[backend.index(PREFIX) :]
 
 
 def check_command(backend: str) -> list[str]:
-    """The words of ``[NAME=]command:PROGRAM ... {sequence} ... {trajectory}``.
+    """Split ``[NAME=]command:PROGRAM ... {sequence} ... {trajectory}`` into words.
 
     Raises:
-        InputError: no program, a blank that is missing, or quotes that are not closed; a program
-            that is not there.
+        InputError: no such program, a missing placeholder, or an unclosed quote.
     """
     text = command_of(backend).removeprefix(PREFIX)
     try:
@@ -92,20 +91,20 @@ def check_command(backend: str) -> list[str]:
 def run_command(
     backend: str, sequence: Sequence, trajectory: Path, timeout_s: float
 ) -> CommandCost:
-    """Let a program track a sequence; it must write a TUM trajectory, camera to world.
+    """Run a program over a sequence; it must write a TUM trajectory, camera to world.
 
-    Its folder ``{sequence}`` is as ``write_frames`` has it; ``{trajectory}`` is the file that it
-    is to write. A frame without a pose is one that it has lost.
+    ``{sequence}`` becomes a folder made by ``write_frames``, ``{trajectory}`` the file to write. A
+    frame without a pose counts as lost.
 
     Args:
         backend: ``command:PROGRAM ...``.
-        sequence: whose frames it is shown.
-        trajectory: where its trajectory is kept.
-        timeout_s: after so many seconds it is stopped.
+        sequence: sequence whose frames the program reads.
+        trajectory: file to copy its trajectory to.
+        timeout_s: seconds after which the program is stopped.
 
     Raises:
-        InputError: it cannot be run, fails, takes too long, writes no trajectory, or one with more
-            poses than there are frames or at other times.
+        InputError: the program cannot be run, fails, takes too long, writes no trajectory, or
+            writes a pose that matches no frame in time.
     """
     words = check_command(backend)
     about = f"command {backend.removeprefix(PREFIX)!r}"
@@ -134,7 +133,7 @@ def _run(words: list[str], folder: Path, about: str, timeout_s: float) -> Comman
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,  # what it starts in turn ends with it
+                start_new_session=True,  # so that its child processes end with it
             )
         except OSError as error:
             raise InputError(f"{about} cannot be run: {error.strerror}") from None
@@ -154,7 +153,7 @@ def _run(words: list[str], folder: Path, about: str, timeout_s: float) -> Comman
 
 
 def _check_trajectory(path: Path, sequence: Sequence, about: str) -> None:
-    """Refuse a trajectory that cannot be of these frames."""
+    """Refuse a trajectory with poses at times of no frame."""
     try:
         times, _ = read_trajectory(path)
     except InputError as error:

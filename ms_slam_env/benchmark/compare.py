@@ -55,12 +55,12 @@ DEFAULT_SEQUENCES = (
         )
     ),
 )
-"""A clean and a noisy room, every scene, and what recordings suffer from, alone and together."""
+"""A clean room, every scene with noise, and the faults of recordings, alone and together."""
 
-_TIME = "cpu_ms_mean"  # the only one that is known of a command, too
+_TIME = "cpu_ms_mean"  # the only processor time that is also known for a command
 
 PEERS = ("odometry,stock=true", "volumetric,stock=true")
-"""OpenCV's odometry and Open3D's dense SLAM as they are."""
+"""OpenCV's odometry and Open3D's dense SLAM, unmodified."""
 
 
 @dataclass(frozen=True)
@@ -75,35 +75,35 @@ class Compare(Experiment, Checked):
     """Folders, or scene:seed[:word[+word ...]]."""
     backends: tuple[str, ...] = (*slam.BACKENDS, *PEERS)
     """NAME, parameters appended as in surfel,loop_closure=deformation; odometry,stock=true is
-    OpenCV's odometry as it is, volumetric,stock=true Open3D's dense SLAM. Any other system is
-    "NAME=command:PROGRAM --in {sequence} --out {trajectory}", NAME= for the tables: it reads a
-    folder in the TUM layout and writes a TUM trajectory."""
+    OpenCV's unmodified odometry, volumetric,stock=true Open3D's dense SLAM. Any other system is
+    "NAME=command:PROGRAM --in {sequence} --out {trajectory}", where NAME is for the tables: it
+    reads a folder in the TUM layout and writes a TUM trajectory."""
     image_sizes: tuple[str, ...] = ("160x120", "320x240")
-    """Such as 160x120."""
+    """Sizes of the images, such as 160x120."""
     frames: int = bounded(200, 10, 100_000)
-    """Of a rendered sequence."""
+    """Number of frames of a rendered sequence."""
     speed_m_s: float = 0.5
-    """Mean speed of the camera of a rendered sequence, where it does not turn."""
+    """Mean speed of the camera in a rendered sequence, while it does not turn."""
     turn_deg_s: float = 30.0
-    """Mean speed of rotation, where it turns."""
+    """Mean speed of rotation, while it turns."""
     threads: int = bounded(1, 1, 1024)
     """Cores that a backend may use."""
     command_timeout_s: float = bounded(3600.0, 0.1, 1e6)
     """Seconds after which a command is stopped."""
     repeats: int = bounded(1, 1, 1000)
-    """Runs of each; the tables show medians."""
+    """Number of runs of each backend on each sequence; the tables show medians."""
     trajectories: tuple[str, ...] = ()
-    """Systems from outside, as NAME=FILE: TUM files, camera to world, with {sequence} in the place
-    of the sequence's name, as in orb=orb/{sequence}.txt."""
+    """Trajectories of external systems, as NAME=FILE: TUM files, camera to world, with {sequence}
+    in place of the sequence's name, as in orb=orb/{sequence}.txt."""
     reference: str = ""
-    """Backend or trajectory that the others are set against in pairs; by default the first."""
+    """Backend or trajectory to compare the others with, pairwise; by default the first."""
 
     workers = 1
     fresh_process = True
     tracks = True
 
     def __post_init__(self) -> None:
-        """Refuse what no run could use."""
+        """Refuse options that would fail every run."""
         super().__post_init__()
         for name in ("sequences", "backends", "image_sizes"):
             if not getattr(self, name):
@@ -132,11 +132,11 @@ class Compare(Experiment, Checked):
             raise unknown("reference", self.reference, names)
 
     def environment(self) -> Mapping[str, str]:
-        """Libraries may start as many threads as a backend may use."""
+        """Limit the libraries' threads to those that a backend may use."""
         return thread_environment(self.threads)
 
     def specs(self) -> list[CompareSpec]:
-        """Every run; those of one sequence and size are neighbours."""
+        """List every run, grouped by sequence and image size within a repeat."""
         shared = self.frames, self.speed_m_s, self.turn_deg_s, self.threads
         found = []
         for repeat in range(self.repeats):
@@ -162,7 +162,7 @@ class Compare(Experiment, Checked):
         """Refuse a system without a single trajectory.
 
         Raises:
-            InputError: naming the files that were looked for.
+            InputError: names the missing files.
         """
         for pattern in self._patterns():
             files = [pattern.file(sequence) for sequence in self.sequences]
@@ -175,19 +175,19 @@ class Compare(Experiment, Checked):
 
     @staticmethod
     def run(spec: CompareSpec) -> dict[str, Any]:
-        """Measure a backend, or the trajectory of another system."""
+        """Measure a backend, a command, or the trajectory of an external system."""
         limit_threads(spec.threads)
         if spec.trajectory:
             return judge_trajectory(spec)
         return judge_command(spec) if spec.command else run_backend(spec)
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """For each image size every sequence with medians, then differences in pairs."""
+        """Tabulate, for each image size, the sequences with medians, then paired differences."""
         names = dict.fromkeys(row["spec"]["backend"] for row in rows)
         return comparison_tables(rows, self.reference or next(iter(names), ""))
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Error against processor time, a panel for each image size, a mark for each sequence."""
+        """Plot error against processor time, one panel per image size, one mark per run."""
         panels = []
         timed = [row for row in finished(rows) if row["result"].get(_TIME) is not None]
         for size in dict.fromkeys(row["spec"]["image_size"] for row in timed):
@@ -198,7 +198,7 @@ class Compare(Experiment, Checked):
 
 
 def _left_out(rows: Sequence[Row]) -> str:
-    """Of which runs the figure has no mark: those that failed, and those of unknown time."""
+    """Name the runs that the figure leaves out: failed, or of unknown time."""
     total = Counter(row["spec"]["backend"] for row in rows)
     failed = [row for row in rows if row["error"] is not None]
     untimed = [row for row in finished(rows) if row["result"].get(_TIME) is None]
@@ -220,21 +220,21 @@ _BLANK = "{sequence}"
 
 @dataclass(frozen=True)
 class CompareSpec:
-    """A system on a sequence.
+    """One run of a system on a sequence.
 
     Attributes:
         sequence: a folder, or ``scene:seed[:word[+word ...]]``.
-        backend: ``NAME`` or ``NAME,parameter=value,...``; of a trajectory or a command any name.
+        backend: ``NAME`` or ``NAME,parameter=value,...``; any name for a trajectory or a command.
         image_size: such as 160x120.
-        frames: of a rendered sequence.
-        speed_m_s: mean speed of the camera of a rendered sequence, where it does not turn.
-        turn_deg_s: mean speed of rotation, where it turns.
+        frames: number of frames of a rendered sequence.
+        speed_m_s: mean speed of the camera in a rendered sequence, while it does not turn.
+        turn_deg_s: mean speed of rotation, while it turns.
         threads: cores that the backend may use.
-        repeat: runs of one specification are told apart by this number.
-        trajectory: TUM file that is judged in place of a backend.
-        digest: of what it holds.
-        timeout_s: of a command.
-        command: ``command:PROGRAM ...`` that is run in place of a backend.
+        repeat: number that tells repeated runs apart.
+        trajectory: TUM file that is evaluated instead of a backend.
+        digest: digest of that file's content.
+        timeout_s: seconds after which a command is stopped.
+        command: ``command:PROGRAM ...`` that is run instead of a backend.
     """
 
     sequence: str
@@ -252,25 +252,25 @@ class CompareSpec:
 
     @property
     def path(self) -> HandheldPath:
-        """Of a rendered sequence."""
+        """The camera path of a rendered sequence."""
         return HandheldPath(self.frames, speed_m_s=self.speed_m_s, turn_deg_s=self.turn_deg_s)
 
 
 @dataclass(frozen=True)
 class TrajectoryPattern:
-    """Trajectories of another system, a file a sequence.
+    """Trajectories of an external system, one file per sequence.
 
     Attributes:
-        name: of the system.
-        pattern: path with ``{sequence}`` in the place of the sequence's name (of a folder its last
-            part).
+        name: name of the system.
+        pattern: path with ``{sequence}`` in place of the sequence's name (for a folder, the last
+            part of its path).
     """
 
     name: str
     pattern: str
 
     def file(self, sequence: str) -> Path:
-        """The file of a sequence."""
+        """Return the file for a sequence."""
         name = Path(sequence).name if "/" in sequence else sequence
         return Path(self.pattern.replace(_BLANK, name))
 
@@ -292,9 +292,8 @@ def parse_trajectories(text: str, several: bool) -> TrajectoryPattern:
 def run_backend(spec: CompareSpec) -> dict[str, Any]:
     """Track the sequence from its true first pose and measure.
 
-    Costs are those of the frames after the first; memory is the peak that the backend alone needs,
-    libraries included, frames not. The map is judged against the surface that the true trajectory
-    saw.
+    Costs exclude the first frames; memory is the backend's own peak, including libraries but not
+    frames. The map is evaluated against the surface seen from the true trajectory.
     """
     given = open_with_surface(spec.sequence, spec.image_size, spec.path)
     name, params = parse_named(spec.backend, "backend")
@@ -309,10 +308,10 @@ def run_backend(spec: CompareSpec) -> dict[str, Any]:
 
 
 def judge_command(spec: CompareSpec) -> dict[str, Any]:
-    """Let a program track the sequence, and measure its trajectory and its time.
+    """Run a program over the sequence; measure its trajectory and its time.
 
-    Times are of the whole program over the number of frames: its start counts, and its reading of
-    the images. Memory and map are not known.
+    Times are those of the whole program divided by the number of frames, including its start and
+    its reading of images. Memory and map are not measured.
     """
     sequence = _opened(spec)
     with tempfile.TemporaryDirectory(prefix="ms-slam-compare-") as folder:
@@ -327,13 +326,13 @@ def judge_command(spec: CompareSpec) -> dict[str, Any]:
 
 
 def judge_trajectory(spec: CompareSpec) -> dict[str, Any]:
-    """Measure a trajectory file as if a backend had said its poses; costs and map are not known.
+    """Measure a trajectory file like the poses of a backend; costs and map are not measured.
 
-    A frame without a pose holds the one before, as a backend does that is lost; those before the
-    first hold that one. Which others were not tracked says a ``frames.csv`` beside the file.
+    A frame without a pose keeps the previous pose, as in a backend that is lost; frames before the
+    first pose get that pose. A ``frames.csv`` beside the file marks other untracked frames.
 
     Raises:
-        InputError: a file that cannot be read, or has fewer than two poses of the sequence.
+        InputError: the file cannot be read, or has fewer than two poses of the sequence.
     """
     return _judged(Path(spec.trajectory), _opened(spec))
 
@@ -360,7 +359,7 @@ def _judged(path: Path, sequence: RGBDSequence) -> dict[str, Any]:
 
 
 def _errors(estimates: Float64, truth: Float64, tracked: NDArray[np.bool_]) -> dict[str, Any]:
-    """Errors of poses (N, 4, 4) that start at the true first pose."""
+    """Measure the errors of poses (N, 4, 4) that start at the true first pose."""
     ate = metrics.ate_statistics(estimates, truth)
     return {
         "frames": len(estimates),

@@ -1,4 +1,4 @@
-"""Tables of the comparison of SLAM systems: every sequence, medians, differences in pairs."""
+"""Tables that compare SLAM systems: every sequence, medians, paired differences."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ METRICS = (
     *("mem_peak_mb", "ene_frame_j", "ene_model_frame_j"),
 )
 PAIRED = ("ate_m", "ate_tracked_m", "rpe_m", "tracked_share", "f_score_2cm", "cpu_ms_median")
-"""Measures whose differences from the reference are given."""
+"""Metrics for which differences from the reference are reported."""
 MEDIAN = "median"
-_LONGEST = 100  # characters of a reason
+_LONGEST = 100  # characters shown of a reason
 
 Cell = Mapping[str, Any]
 
 
 def comparison_tables(rows: Sequence[Row], reference: str) -> list[Table]:
-    """Of each image size: every sequence with medians, then differences from ``reference``."""
+    """Tabulate, per image size, the sequences with medians, then differences from ``reference``."""
     cells = cells_of(rows)
     tables = []
     for size in dict.fromkeys(cell["image_size"] for cell in cells):
@@ -41,7 +41,7 @@ def comparison_tables(rows: Sequence[Row], reference: str) -> list[Table]:
 
 
 def groups_of(rows: Sequence[Row]) -> list[list[Row]]:
-    """The repeats of each image size, sequence and system."""
+    """Group the rows that repeat one image size, sequence and system."""
     groups: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         key = tuple(row["spec"][name] for name in ("image_size", "sequence", "backend"))
@@ -50,13 +50,13 @@ def groups_of(rows: Sequence[Row]) -> list[list[Row]]:
 
 
 def cells_of(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """One of each image size, sequence and system."""
+    """Return one cell for each image size, sequence and system."""
     shown = distinct_names([row["spec"]["sequence"] for row in rows])
     return [_cell_of(group, shown) for group in groups_of(rows)]
 
 
 def distinct_names(sequences: Sequence[str]) -> dict[str, str]:
-    """Names of sequences: of folders, as much of the ends of their paths as tells them apart."""
+    """Name sequences; a folder by the shortest end of its path that tells it apart."""
     paths = {text: Path(text).parts if "/" in text else (text,) for text in sequences}
     names: dict[str, str] = {}
     for text, parts in paths.items():
@@ -69,7 +69,7 @@ def distinct_names(sequences: Sequence[str]) -> dict[str, str]:
 
 
 def _cell_of(repeats: Sequence[Row], shown: Mapping[str, str]) -> dict[str, Any]:
-    """Medians over repeats; the error where all failed."""
+    """Return the medians over repeats; the first error if all failed."""
     spec = repeats[0]["spec"]
     cell: dict[str, Any] = {
         "image_size": spec["image_size"],
@@ -84,7 +84,7 @@ def _cell_of(repeats: Sequence[Row], shown: Mapping[str, str]) -> dict[str, Any]
 
 
 def medians(cells: Sequence[Cell]) -> list[dict[str, Any]]:
-    """Medians with intervals over the sequences that a system finished, a line for each."""
+    """Return a line per system: medians with intervals over the sequences that it finished."""
     lines = []
     for backend, own in _finished(cells).items():
         known = {key: summary(own, key) for key in METRICS if any(key in cell for cell in own)}
@@ -94,7 +94,7 @@ def medians(cells: Sequence[Cell]) -> list[dict[str, Any]]:
 
 
 def _finished(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
-    """By system, the cells of the sequences that it finished; of one that failed on all, none."""
+    """Group the cells of finished sequences by system; empty for one that failed on all."""
     found: dict[str, list[Cell]] = {cell["backend"]: [] for cell in cells}
     for cell in cells:
         if "error" not in cell:
@@ -103,7 +103,7 @@ def _finished(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
 
 
 def failures(cells: Sequence[Cell]) -> dict[str, list[str]]:
-    """By system that failed, the sequences that it did not finish, and why."""
+    """List, for each system that failed, the sequences that it did not finish, and why."""
     found: dict[str, list[str]] = {}
     for cell in cells:
         if "error" in cell:
@@ -114,13 +114,13 @@ def failures(cells: Sequence[Cell]) -> dict[str, list[str]]:
 
 
 def _columns(cells: Sequence[Cell]) -> list[str]:
-    """Of a table; energy only where a machine counts it, errors only where there are some."""
+    """Return the columns of a table, without metrics and errors that no cell has."""
     shown = [key for key in (*METRICS, "error") if any(key in cell for cell in cells)]
     return ["sequence", "backend", "sequences_count", *shown]
 
 
 def _note(cells: Sequence[Cell]) -> str:
-    """Over what the medians are: which system failed where and why, which measures have fewer."""
+    """Say what the medians cover: which system failed where and why, which metrics have gaps."""
     total, finished_by = len({cell["sequence"] for cell in cells}), _finished(cells)
     note = f"{MEDIAN.capitalize()}: over the sequences that a backend finished, of {total}"
     note += "".join(
@@ -138,9 +138,9 @@ def _note(cells: Sequence[Cell]) -> str:
 
 
 def _differences(cells: Sequence[Cell], reference: str) -> Table | None:
-    """What each system has more than the reference on what both finished, and where it is better.
+    """Tabulate each system's differences from the reference, and how often it is better.
 
-    None where there is nothing to set against each other.
+    Only sequences that both finished count. None if no system shares one with the reference.
     """
     by_system = {
         backend: {cell["sequence"]: cell for cell in own}

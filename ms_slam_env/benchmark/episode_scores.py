@@ -1,4 +1,4 @@
-"""What came of an episode: errors of the trajectory, losses, quality of the map."""
+"""Scores of an episode: trajectory errors, losses, quality of the map."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from ms_slam_env.evaluation.map_truth import reference_surface, true_surface
 from ms_slam_env.slam.slam_backend import SlamBackend
 
 LOST_ERROR_M = 0.3
-"""An estimate this far off is lost even where SLAM does not say so."""
+"""An estimate farther off than this counts as lost, even if SLAM does not report it."""
 LOOK_EVERY = 5
-"""Steps between two looks at the map.
+"""Steps between two evaluations of the map.
 
-A look takes 17 to 43 ms of an episode in a room, a step 17 to 31 ms with the planner; the area
-under the curve differs by less than 0.05 percentage points from that of a look a step.
+In a room, an evaluation takes 17 to 43 ms and a step, with the planner, 17 to 31 ms. The area under
+the curve differs by less than 0.05 percentage points from that of an evaluation at every step.
 """
 
-_LAST: dict[tuple[Any, ...], Float64] = {}  # planners of one scene and seed follow each other
+_LAST: dict[tuple[Any, ...], Float64] = {}  # reused by consecutive planners of one scene and seed
 
 
 class MapScores:
-    """Judges the map of one episode, while it grows and at its end.
+    """Evaluates the map of one episode, while it grows and at its end.
 
     Args:
-        world: in which the episode is played.
-        scene, seed: where it is played.
-        reference: of the task; see :class:`ms_slam_env.tasks.Task`.
+        world: environment in which the episode is played.
+        scene, seed: scene in which it is played.
+        reference: reference of the task; see :class:`ms_slam_env.tasks.Task`.
     """
 
     def __init__(self, world: ActiveSlamEnv, scene: str, seed: int, reference: str) -> None:
@@ -38,7 +38,7 @@ class MapScores:
         self._kind = reference
 
     def after_step(self, step: int) -> None:
-        """Look at the map at the start, which is step 0, and every ``LOOK_EVERY`` steps."""
+        """Evaluate the map at the start (step 0) and every ``LOOK_EVERY`` steps."""
         if step == 0:
             self._reference = _reference(self._world, (*self._place, self._kind))
             coarse = true_surface(*self._place, SURFACE_SPACING_M)
@@ -47,16 +47,16 @@ class MapScores:
             self._curve.look(step, anchored_points(self._world.slam))
 
     def result(self, made: int, planned: int) -> dict[str, Any]:
-        """Map metrics, the map placed by its estimated poses, after ``made`` steps.
+        """Return the map metrics after ``made`` steps, with the map at its estimated poses.
 
         ``precision_*``, ``recall_*`` and ``f_score_*`` at 2 and 5 cm, ``rcm`` (the recall at 5 cm),
         ``rer_m`` (RMS distance to the true surface after ICP), ``mapped_area_m2`` (true surface
-        that a tracked frame put less than 5 cm from its place, in faces of 5 cm voxels),
-        ``f_score_5cm_area`` over the ``planned`` steps, and the curve that it is the area of.
+        that a tracked frame placed within 5 cm, in faces of 5 cm voxels), ``f_score_5cm_area`` over
+        the ``planned`` steps, and the curve under which that is the area.
 
-        Judged is the whole map. Surfels that SLAM calls stable were seen in some ten frames:
-        counting only those would reward looking at one place for long. Submaps that are not joined
-        to the first do not count: where they lie is a guess.
+        The whole map counts. Surfels that SLAM calls stable were seen in about ten frames; counting
+        only those would reward looking at one place for long. Submaps that are not joined to the
+        first do not count, because their position is a guess.
         """
         points = anchored_points(self._world.slam)
         curve = self._curve
@@ -72,14 +72,14 @@ class MapScores:
 
 
 def anchored_points(slam: SlamBackend) -> Float64:
-    """Points (N, 3) of the first submap and of those that are joined to it."""
+    """Return the points (N, 3) of the first submap and of the submaps joined to it."""
     points = slam.map_points()
     number = slam.map_attributes().get("submap") if len(slam.submaps()) > 1 else None
     return points if number is None else points[slam.submaps().joined_to[number] == 0]
 
 
 def _reference(world: ActiveSlamEnv, key: tuple[str, int, str]) -> Float64:
-    """The true points (K, 3) that a map should have, by the task's kind of reference."""
+    """Return the true points (K, 3) that a map should have, by the task's kind of reference."""
     start = world.episode.frames[0].T_world_camera
     full = (*key, start.tobytes(), world.intrinsics, repr(world.config.arm))
     if full not in _LAST:
@@ -90,14 +90,14 @@ def _reference(world: ActiveSlamEnv, key: tuple[str, int, str]) -> Float64:
 
 
 def measure_trajectory(world: ActiveSlamEnv) -> dict[str, Any]:
-    """Trajectory metrics of the episode just played.
+    """Return the trajectory metrics of the episode just played.
 
     ``ate_m`` (RMSE) and ``ate_max_m`` after SE(3) alignment, ``ate_tracked_m`` and
-    ``tracked_share`` of the tracked frames, ``ate_unaligned_m`` with the common
-    start as the only tie, ``rpe_m`` and ``rpe_rad`` per frame, ``path_length_m`` of the true
-    trajectory, ``M_I`` and ``M_D`` (equations 11 and 12), ``violations`` (share of the frames after
-    the first that exceed the environment's M_I or M_D), and ``lost``: some frame was off by more
-    than ``LOST_ERROR_M``.
+    ``tracked_share`` of the tracked frames, ``ate_unaligned_m`` without alignment beyond the common
+    start, ``rpe_m`` and ``rpe_rad`` per frame, ``path_length_m`` of the true trajectory, ``M_I``
+    and ``M_D`` (equations 11 and 12), ``violations`` (share of the frames after the first that
+    exceed the environment's M_I or M_D), and ``lost`` (some frame was off by more than
+    ``LOST_ERROR_M``).
     """
     truth, estimate = world.episode.trajectory_truth, world.episode.trajectory_estimate
     aligned = metrics.ate_statistics(estimate, truth)
@@ -119,10 +119,10 @@ def measure_trajectory(world: ActiveSlamEnv) -> dict[str, Any]:
 
 
 def measure_losses(world: ActiveSlamEnv) -> dict[str, int]:
-    """How often the camera was lost in the episode just played, and how often for good.
+    """Count the losses in the episode just played, and those never recovered.
 
-    A loss begins at a frame that is not tracked, or in a submap that is not joined to the first, or
-    more than ``LOST_ERROR_M`` off; it ends with one that is none of that.
+    A loss begins at a frame that is untracked, in a submap that is not joined to the first, or more
+    than ``LOST_ERROR_M`` off. It ends at the next frame to which none of these applies.
     """
     frames = world.episode.frames
     lost = [

@@ -1,4 +1,4 @@
-"""One episode of one planner: what to run, and what came of it."""
+"""Specify, play and measure one episode of one planner."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ OWN_OPTIONS = (
     *("scene", "scene_seed", "split", "observation", "step_m", "step_rad"),
     *("render_mode", "max_episode_steps", "frame_divergences"),
 )
-"""Options of ``gym.make`` that an episode has other options for, or that its planner decides."""
+"""Options of ``gym.make`` that an episode or its planner sets."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,14 @@ class EpisodeSpec(Checked):
     Attributes:
         planner: ``NAME,option=value,...``.
         scene: a scene's name or a mesh file.
-        seed: of the scene, the start pose, the sensor noise and, by way of a child of its own, the
-            planner.
+        seed: seed of the scene, the start pose, the sensor noise and the planner (through a child
+            seed).
         env_id: one of ``ms_slam_env.ENV_IDS``.
         steps: length of the episode.
         step_m: translation of a motion.
         step_deg: rotation of a motion.
         options: further options of the environment.
-        task: whose are the options that are not given, the perturbations and the reference.
+        task: task that supplies missing options, the perturbations and the reference.
     """
 
     planner: str
@@ -93,10 +93,10 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
     """Run one episode and measure it.
 
     Returns:
-        the metrics by name, see :mod:`.episode_scores`, with
-        ``steps``, ``return``, ``decision_ms`` (mean time of a decision), ``ate_over_steps``
-        (running RMSE, unaligned, metres, when the map was looked at), ``time_s`` (simulated) and
-        ``energy_j`` (mechanical work of the motion).
+        metrics by name, see :mod:`.episode_scores`, with ``steps``, ``return``, ``decision_ms``
+        (mean time of a decision), ``ate_over_steps`` (running RMSE, unaligned, metres, at the steps
+        when the map is scored), ``time_s`` (simulated) and ``energy_j`` (mechanical work of the
+        motion).
     """
     from ms_slam_env.benchmark.episode_scores import (
         MapScores,
@@ -122,14 +122,14 @@ def run_episode(spec: EpisodeSpec) -> dict[str, Any]:
 
 
 def planned_motion(spec: EpisodeSpec) -> tuple[Float64, Float64, dict[str, Any]]:
-    """Where a planner moves the camera in an episode, to be rendered again as a sequence.
+    """Play an episode and return the camera's motion, to be rendered again as a sequence.
 
     Returns:
-        simulated seconds (N,) of each frame from the episode's start, true poses (N, 4, 4) of every
-        frame, those within a step among them, and what to note of the episode beside the sequence.
+        simulated seconds (N,) of each frame since the episode's start, true poses (N, 4, 4) of
+        every frame, including those within a step, and a description of the episode.
 
     Raises:
-        InputError: an unknown planner, scene or option, or no start pose.
+        InputError: an unknown planner, scene or option, or no valid start pose.
     """
     check_planner(spec.planner)
     env = make_env(spec)
@@ -144,13 +144,13 @@ def planned_motion(spec: EpisodeSpec) -> tuple[Float64, Float64, dict[str, Any]]
 
 
 def check_episodes(specs: Sequence[EpisodeSpec]) -> None:
-    """Refuse now what would make episodes fail at their start, by starting one of each planner.
+    """Fail early: make the environment and planner of each different kind of episode.
 
     Scenes are not built.
 
     Raises:
         InputError: options that the environment, SLAM or a planner refuses, or a planner that
-            fails as it is made.
+            cannot be constructed.
     """
     different = {
         (spec.planner, spec.env_id, spec.step_m, spec.step_deg, str(spec.options)): spec
@@ -162,7 +162,7 @@ def check_episodes(specs: Sequence[EpisodeSpec]) -> None:
             make_planner(spec.planner, env.unwrapped, spec.seed)
         except InputError:
             raise
-        except Exception as error:  # a planner of somebody else may raise anything
+        except Exception as error:  # a third-party planner may raise anything
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             raise InputError(f"planner {spec.planner!r} cannot be made: {reason}") from error
         finally:
@@ -170,7 +170,7 @@ def check_episodes(specs: Sequence[EpisodeSpec]) -> None:
 
 
 def make_env(spec: EpisodeSpec) -> gym.Env[Any, Any]:
-    """The environment of an episode."""
+    """Make the environment of an episode."""
     return gym.make(
         spec.env_id,
         max_episode_steps=spec.steps,
@@ -197,8 +197,8 @@ def play(
 ) -> dict[str, Any]:
     """Play one episode to its end, or until ``seconds`` of simulated time have passed.
 
-    It begins at ``start`` (4, 4) if that is given, else at a pose that the seed draws.
-    ``after_step`` is called with 0 after the reset, then with the number of each step after it.
+    The episode starts at ``start`` (4, 4) if given, else at a pose drawn with the seed.
+    ``after_step`` is called with 0 after the reset, then with the step's number after each step.
     """
     options = None if start is None else {"T_world_camera": start}
     observation, info = env.reset(seed=seed, options=options)
@@ -230,7 +230,7 @@ def play(
 
 
 def parse_options(texts: Sequence[str]) -> dict[str, Any]:
-    """Nested mapping of ``EnvConfig``, and ``embodiment``, from texts ``name.name=value``.
+    """Parse ``name.name=value`` into a nested mapping of ``EnvConfig`` and ``embodiment``.
 
     Values are YAML.
 
@@ -257,14 +257,14 @@ def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
     """Refuse unknown planners and scenes, and mesh files that cannot be read.
 
     Raises:
-        InputError: naming the valid choices, or what is wrong with the file.
+        InputError: lists the valid choices, or says what is wrong with the file.
     """
     for kind, names in (("planner", planners), ("scene", scenes)):
         if not names:
             raise InputError(f"no {kind} given")
         if len(set(names)) < len(names):
             raise InputError(f"a {kind} is given twice: {', '.join(names)}")
-    for scene in scenes:  # the cheapest first: a planner may take seconds to import
+    for scene in scenes:  # cheapest check first: a planner may take seconds to import
         check_name(scene)
     for planner in planners:
         check_planner(planner)
@@ -276,10 +276,10 @@ def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
 
 
 def seed_list(split: str, count: int) -> list[int]:
-    """The first ``count`` seeds of a split; seeds of one's own are all meant.
+    """Return the first ``count`` seeds of a split; of explicit seeds, all.
 
     Raises:
-        InputError: neither a split nor seeds, or more seeds than it has.
+        InputError: neither a split nor seeds, or more seeds than the split has.
     """
     seeds = seeds_of(split)
     if split not in SEED_SPLITS:
@@ -290,9 +290,9 @@ def seed_list(split: str, count: int) -> list[int]:
 
 
 def short_planner_names(planners: Iterable[str]) -> dict[str, str]:
-    """A short text for each planner: its name, with options only where names are the same.
+    """Shorten planners for display: the name, with options only where names are equal.
 
-    Paths among the options lose the folders that are not needed to tell planners apart.
+    Paths in options lose the folders that are not needed to tell planners apart.
     """
     names = {planner: planner.split(",") for planner in planners}
     count = Counter(name for name, *_ in names.values())

@@ -1,4 +1,4 @@
-"""What an experiment is: specifications, what one measures, tables, charts; and where they are."""
+"""The interface of an experiment (specifications, measurement, tables, charts) and its registry."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ S = TypeVar("S")
 class Experiment(ABC):
     """A frozen dataclass whose fields are the options of its command line.
 
-    The first line of its docstring is the title of its results, the rest says what they show.
+    The first line of its docstring is the title of its results; the rest says what they show.
 
     Attributes:
-        unit: what a row is, in the plural, for the progress bar.
-        rows_key: of the rows in ``results.json``.
-        workers: processes by default; None: one a core. 1 where times are measured.
-        fresh_process: run each row in a process of its own, because peak memory is one number for
-            the life of a process.
-        tracks: rows are runs of a backend over a sequence; one that is lost all along is complained
-            about.
-        check_rows: how many rows ``--check`` runs again.
+        unit: plural noun for a row, shown in the progress bar.
+        rows_key: key of the rows in ``results.json``.
+        workers: default number of processes; None: one per core. 1 where times are measured.
+        fresh_process: run each row in a new process, because peak memory is measured over the life
+            of a process.
+        tracks: whether rows are runs of a backend over a sequence; a run that is lost throughout is
+            reported as a failure.
+        check_rows: number of rows that ``--check`` runs again.
     """
 
     unit: ClassVar[str] = "runs"
@@ -49,81 +49,81 @@ class Experiment(ABC):
 
     @abstractmethod
     def specs(self) -> Sequence[Any]:
-        """One frozen dataclass a row, with everything that the row depends on.
+        """List one frozen dataclass per row, with everything that the row depends on.
 
         Raises:
-            InputError: options that no row could be run with.
+            InputError: options with which no row could run.
         """
 
     @staticmethod
     @abstractmethod
     def run(spec: Any) -> dict[str, Any]:
-        """Measure one row: keys of the registry to numbers, flags, texts, or lists of them.
+        """Measure one row; return numbers, flags, texts or lists of them by registry key.
 
-        It runs in a process of its own and depends on ``spec`` alone.
+        Runs in a worker process and must depend on ``spec`` alone.
         """
 
     @abstractmethod
     def tables(self, rows: Sequence[Row]) -> Sequence[Table]:
-        """The tables, the most important first, from rows of which some may have failed."""
+        """Make the tables, the most important first; some of the rows may have failed."""
 
     def charts(self, rows: Sequence[Row]) -> Sequence[Chart]:
-        """The charts; none by default."""
+        """Make the charts; none by default."""
         return ()
 
     def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        """What else belongs into ``results.json``; nothing by default."""
+        """Return further entries of ``results.json``; none by default."""
         return {}
 
     def write_pictures(self, rows: Sequence[Row], out: Path) -> None:  # noqa: B027
-        """Draw into folder ``out`` what no chart can show; nothing by default."""
+        """Write pictures that are not charts into folder ``out``; none by default."""
 
     def spec(self, kind: type[S], **own: Any) -> S:
-        """One of the `specs`: fields ``own``, and the options that are named as its others."""
+        """Make one spec from the fields ``own`` and, for the others, options of the same name."""
         options = {field.name for field in dataclasses.fields(self)}  # type: ignore[arg-type]
         names = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
         shared = {name: getattr(self, name) for name in names if name in options - own.keys()}
         return kind(**shared, **own)
 
     def each(self, kind: type[S], **axes: Sequence[Any]) -> list[S]:
-        """A `spec` of every combination of what ``axes`` say of its fields, the last turning first.
+        """Make a `spec` for every combination of the values in ``axes``; the last varies fastest.
 
         Raises:
-            InputError: an option that many experiments have names what there is not.
+            InputError: an unknown scene, sequence, backend, image size or noise; see `check_names`.
         """
         check_names(self)
         values = itertools.product(*axes.values())
         return [self.spec(kind, **dict(zip(axes, of, strict=True))) for of in values]
 
     def prepare(self) -> None:  # noqa: B027
-        """Refuse, in seconds, what would make every row fail; nothing by default.
+        """Refuse, within seconds, options that would make every row fail; no check by default.
 
         Raises:
-            InputError: what is wrong.
+            InputError: says what is wrong.
         """
 
     def environment(self) -> Mapping[str, str]:
-        """Variables of the processes that run the rows: one thread each, unless set already."""
+        """Environment variables of the worker processes: one thread each, unless already set."""
         return one_thread_unless_set()
 
     @classmethod
     def title(cls) -> str:
-        """First line of the docstring."""
+        """Return the first line of the docstring."""
         return _paragraphs(cls)[0]
 
     @classmethod
     def about(cls) -> str:
-        """The docstring without its first line."""
+        """Return the docstring without its first paragraph."""
         return " ".join(_paragraphs(cls)[1:])
 
 
 def check_names(experiment: Experiment) -> None:
-    """Refuse scenes, sequences, backends, image sizes and noise that there are not.
+    """Refuse unknown scenes, sequences, backends, image sizes and noise.
 
-    They are known by the names of the options: an experiment has no need to check them itself.
+    Options are recognised by their names, so an experiment need not check them itself.
 
     Raises:
-        InputError: with the valid choices.
+        InputError: lists the valid choices.
     """
     from ms_slam_env import slam
     from ms_slam_env.camera import parse_image_size
@@ -147,10 +147,10 @@ def check_names(experiment: Experiment) -> None:
 
 
 def check_each(kind: str, given: Sequence[str], valid: Iterable[str]) -> None:
-    """Refuse a list of a ``kind`` of thing that is empty, or has one twice or an unknown one.
+    """Refuse a list that is empty, repeats an entry or has an unknown one; ``kind`` names an entry.
 
     Raises:
-        InputError: naming it; of an unknown one, with the valid choices.
+        InputError: names the entry; for an unknown one, lists the valid choices.
     """
     if not given or len(set(given)) < len(given):
         raise InputError(f"{kind}s {', '.join(given)!r} must be different, at least one")
@@ -161,18 +161,18 @@ def check_each(kind: str, given: Sequence[str], valid: Iterable[str]) -> None:
 
 
 def _paragraphs(cls: type) -> list[str]:
-    """Paragraphs of a docstring, each on one line."""
+    """Split a class's docstring into paragraphs, each on one line."""
     text = cls.__doc__ or cls.__name__
     return [" ".join(part.split()) for part in text.strip().split("\n\n")]
 
 
 _RESEARCH = importlib.util.find_spec("ms_slam_experiments")
 HAS_RESEARCH = _RESEARCH is not None
-"""Whether this is a checkout, which has the experiments of the project besides."""
+"""Whether this is a checkout, which also has the project's research experiments."""
 
 
 def _own() -> dict[str, str]:
-    """Modules by name."""
+    """Return the modules of the project's experiments by name."""
     own = {name: f"ms_slam_env.benchmark.{name}" for name in ("compare", "planners", "usme")}
     if _RESEARCH and _RESEARCH.submodule_search_locations:
         modules = pkgutil.iter_modules(_RESEARCH.submodule_search_locations)
@@ -181,11 +181,11 @@ def _own() -> dict[str, str]:
 
 
 EXPERIMENTS = ExtensionPoint("experiment", "ms_slam_env.experiments", Experiment, own=_own())
-"""Where experiments are found; ours are modules that are not imported before."""
+"""Registry of experiments; the project's own are modules that are imported on first use."""
 
 
 def experiment_class(name: str) -> type[Experiment]:
-    """The experiment of a name; ``step-size`` and ``step_size`` are the same.
+    """Return the experiment with this name; ``step-size`` and ``step_size`` are the same.
 
     Raises:
         InputError: an unknown name; the message lists the valid ones.

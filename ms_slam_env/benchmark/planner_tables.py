@@ -1,4 +1,4 @@
-"""Tables that compare planners: losses together, and aggregates across scenes."""
+"""Tables that compare planners: pooled losses, and aggregates across scenes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ms_slam_env.report.tables import (
 )
 
 RANKED_BY = "f_score_5cm"
-"""Standing still loses it by recall, getting lost by precision."""
+"""A camera that stands still loses recall, one that gets lost loses precision."""
 HEADLINE = (
     *("f_score_5cm", "f_score_5cm_area", "f_score_2cm", "rcm", "ate_m", "ate_tracked_m"),
     *("tracked_share", "lost", "violations", "path_length_m", "energy_j", "decision_ms"),
@@ -33,10 +33,9 @@ DETAILS = ("ate_max_m", "rpe_m", "rer_m", "mapped_area_m2", "M_I", "M_D", "retur
 
 
 def with_losses(table: Table, rows: Sequence[Row]) -> Table:
-    """The table with the losses of each planner's episodes together, and those not recovered.
+    """Add each planner's total losses and share of losses not recovered to a table.
 
-    Without the energy where nothing with a mass was moved. Results of a time when losses were not
-    counted have none.
+    The energy column is dropped if no energy was used. Older results have no counts of losses.
     """
     results = grouped(rows, ("planner",))
     lines = []
@@ -55,9 +54,9 @@ def with_losses(table: Table, rows: Sequence[Row]) -> Table:
 
 
 def score_matrices(rows: Sequence[Row], metric: str = RANKED_BY) -> dict[str, NDArray[np.float64]]:
-    """Scores (episodes, scenes) of each planner that finished an episode in every scene.
+    """Return the scores (episodes, scenes) of each planner with an episode in every scene.
 
-    Scenes with more finished episodes than another lose the surplus.
+    Scenes with more finished episodes than the others lose the surplus.
     """
     scenes = list(dict.fromkeys(row["spec"]["scene"] for row in rows))
     matrices = {}
@@ -78,7 +77,7 @@ def score_matrices(rows: Sequence[Row], metric: str = RANKED_BY) -> dict[str, ND
 
 
 def across_scenes(rows: Sequence[Row], title: str = "") -> list[Table]:
-    """Interquartile means, best first."""
+    """Tabulate the interquartile means, best planner first."""
     scores = score_matrices(rows)
     if not scores:
         return []
@@ -95,15 +94,15 @@ COMPARED = {
     "f_score_5cm_area": ("Sooner than each other", "larger area under F-score over steps"),
     "return": ("Better rewarded than each other", "larger return"),
 }
-"""Metrics by which planners are compared two by two; the title of the table, what it is about."""
+"""Metrics by which planners are compared pairwise: title of the table, wording of its note."""
 
 
 def better_than_each_other(
     rows: Sequence[Row], prefix: str = "", metric: str = RANKED_BY
 ) -> list[Table]:
-    """Probability that a line's planner has a better score than a column's.
+    """Tabulate the probability that a row's planner scores better than a column's.
 
-    Nothing of a single planner.
+    Empty for a single planner.
     """
     title, what = COMPARED[metric]
     scores = score_matrices(rows, metric)
@@ -117,9 +116,9 @@ def better_than_each_other(
 def trainings_compared(
     rows: Sequence[Row], prefix: str = "", metric: str = RANKED_BY
 ) -> list[Table]:
-    """``better_than_each_other`` of trainings, of which the policies are resampled, too.
+    """Make ``better_than_each_other`` for trainings, whose policies are also resampled.
 
-    Nothing of a single training or planner.
+    Empty for a single training or planner.
     """
     title, what = COMPARED[metric]
     name_of = _names_of_trainings(rows)
@@ -151,7 +150,7 @@ def _two_by_two(
     title: str,
     note: str,
 ) -> Table:
-    """A line and a column for each planner, in this order."""
+    """Make a table with a row and a column for each planner, in this order."""
     names = tuple(names)
     label = short_planner_names(names)
     columns = [Column(name, "improvement", label[name]) for name in names]
@@ -162,11 +161,11 @@ def _two_by_two(
 
 
 def from_the_same_start(rows: Sequence[Row], prefix: str = "") -> list[Table]:
-    """Share of starts from which a line's planner has the larger area than a column's.
+    """Tabulate the share of starts from which a row's planner has a larger area than a column's.
 
-    Where a seed makes another place, as in `home`, this is what tells planners apart: between two
-    places the areas differ more than between two planners. Only the starts count that every planner
-    finished, and of two planners those with other areas. Nothing of a single planner.
+    This separates planners where each seed makes another place, as in `home`: there the areas
+    differ more between places than between planners. Only starts that every planner finished
+    count and, for a pair of planners, only those with different areas. Empty for a single planner.
     """
     area = "f_score_5cm_area"
     known = [row for row in finished(rows) if area in row["result"]]  # older results have no area
@@ -194,11 +193,11 @@ def from_the_same_start(rows: Sequence[Row], prefix: str = "") -> list[Table]:
 
 
 def policies_together(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """The rows with planners that differ in ``path`` alone as one; nothing if there are none.
+    """Merge planners that differ only in ``path`` into one; empty if there are none.
 
-    So several policies of one training, each begun with another seed, are judged as what that
-    training leads to. Files in several folders are those of several trainings; of a file that is
-    the only one in its folder, as a training leaves it, the folder above counts.
+    This pools the policies of one training, each trained with another seed. Files in different
+    folders belong to different trainings; for a file alone in its folder, as a training leaves it,
+    the parent of that folder counts.
     """
     names = _names_of_trainings(rows)
     if all(name == planner for planner, name in names.items()):
@@ -207,7 +206,7 @@ def policies_together(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def _names_of_trainings(rows: Sequence[Row]) -> dict[str, str]:
-    """What planners are called in ``policies_together``: as before those that stand alone."""
+    """Map each planner to its name in ``policies_together``; unmerged planners keep theirs."""
     members: dict[str, list[str]] = {}
     for planner in dict.fromkeys(map(_planner, rows)):
         members.setdefault(_without_path(planner)[0], []).append(planner)
@@ -231,7 +230,7 @@ def _names_of_trainings(rows: Sequence[Row]) -> dict[str, str]:
 
 
 def _without_path(planner: str) -> tuple[str, PurePosixPath | None]:
-    """A planner without its option ``path``, and that; None without one."""
+    """Split a planner into its text without the option ``path``, and that path or None."""
     parts = planner.split(",")
     paths = [PurePosixPath(part[5:]) for part in parts if part.startswith("path=")]
     rest = [part for part in parts if not part.startswith("path=")]

@@ -1,4 +1,4 @@
-"""The planner benchmark: a task's scenes x seeds x planners, all from the same start poses."""
+"""The planner benchmark: scenes x seeds x planners of a task, from the same start poses."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ from ms_slam_env.report.tables import Grouping, Table, complete_cases, finished
 from ms_slam_env.tasks import OWN, find_task
 
 ALL = "all"
-"""Stands for all our tasks."""
+"""Name that stands for all of the package's tasks."""
 PLANNERS = (
     *("random", "stationary", "greedy", "greedy-limited", "max-information"),
     *("nbv", "receding-nbv", "held-nbv", "belief", "graph-dopt"),
 )
-"""Those that need no extra."""
+"""Planners that need no extra."""
 EPISODES, LEADERBOARD_EPISODES = 10, 25
 _PANELS = ("f_score_5cm_area", "f_score_5cm", "ate_m", "path_length_m")
-_FLOOR_M = 5e-5  # errors below are drawn here on logarithmic axes
+_FLOOR_M = 5e-5  # smaller errors are drawn here on logarithmic axes
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,12 @@ class PlannerBenchmark(Experiment):
     scenes: tuple[str, ...] = ()
     """Names of scenes, or mesh files; by default the task's."""
     episodes: int | None = None
-    """Seeds for each scene; by default 10, of the leaderboard 25."""
+    """Number of seeds for each scene; by default 10, for the leaderboard 25."""
     steps: int | None = None
     """Length of an episode; by default the task's."""
     seeds: str = "test"
-    """Split that the seeds come from: train, validation or test; or your own, as 7000-7003 or
-    7000,7005, all of which are played."""
+    """Split of the seeds: train, validation or test; or your own, such as 7000-7003 or 7000,7005,
+    which are all played."""
     env_id: str | None = None
     """Environment; by default the task's."""
     step_m: float | None = None
@@ -86,15 +86,15 @@ class PlannerBenchmark(Experiment):
 
     @property
     def tasks(self) -> Sequence[str]:
-        """The tasks by name."""
+        """Names of the tasks."""
         return tuple(OWN) if self.task == ALL else (self.task,)
 
     def specs(self) -> list[EpisodeSpec]:
-        """Every episode, task by task."""
+        """List every episode, task by task."""
         return [spec for name in self.tasks for spec in self._specs(name)]
 
     def _specs(self, name: str) -> list[EpisodeSpec]:
-        """The episodes of a task, which says what is not given."""
+        """List the episodes of a task; it supplies the options that are not given."""
         task = find_task(name)
         step_rad = task.options.get("step_rad", math.radians(DEFAULT_STEP_DEG))
         usual = {
@@ -127,15 +127,15 @@ class PlannerBenchmark(Experiment):
         check_episodes(self.specs())
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """For each task over all scenes and across scenes, for one task also for each scene."""
+        """Tabulate each task pooled over all scenes, across scenes and for each scene."""
         return [table for task, of in _by_task(rows).items() for table in _tables(of, task)]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Of each task the curve of the F-score, every measure by planner, F-score against ATE."""
+        """Plot, per task, F-score over steps, metrics by planner, F-score against ATE, and ATE."""
         return [chart for task, of in _by_task(rows).items() for chart in _charts(of, task)]
 
     def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        """The seeds, and medians with their intervals by planner, of one task."""
+        """Return the seeds and, for a single task, medians with intervals by planner."""
         seeds = {"seeds": self._seeds}
         if len(self.tasks) > 1:
             return seeds
@@ -151,7 +151,7 @@ class PlannerBenchmark(Experiment):
 
 
 def _by_task(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Rows of the tasks of which an episode finished; of a single one, without its name."""
+    """Group rows by task, without tasks that finished no episode; a single task has no name."""
     found: dict[str, list[Row]] = {}
     for row in rows:
         found.setdefault(row["spec"].get("task", ""), []).append(row)
@@ -160,7 +160,7 @@ def _by_task(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def _tables(rows: Sequence[Row], task: str) -> list[Table]:
-    """The tables of one task, whose name their titles have if there are several."""
+    """Make the tables of one task; ``task`` prefixes their titles if there are several."""
     prefix = f"{task}: " if task else ""
     pairs = complete_cases(rows, ("scene", "seed"), "planner")
     headline = Grouping(("planner",), HEADLINE, rank_by=RANKED_BY, count="episodes")
@@ -188,7 +188,7 @@ def _tables(rows: Sequence[Row], task: str) -> list[Table]:
 
 
 def _length(spec: Mapping[str, Any]) -> str:
-    """How long an episode is, in words: the time that it has, or else its steps."""
+    """Say how long an episode is: its simulated time if limited, else its steps."""
     task = OWN.get(spec.get("task", ""))
     seconds = {**(task().options if task else {}), **spec["options"]}.get("seconds")
     return (
@@ -199,7 +199,7 @@ def _length(spec: Mapping[str, Any]) -> str:
 def _policies_as_one(
     rows: Sequence[Row], pairs: Sequence[Mapping[str, Any]], title: str
 ) -> list[Table]:
-    """Tables of trainings in place of their policies; none if there are none of several."""
+    """Make tables of trainings instead of their policies; none without several policies of one."""
     if not policies_together(finished(rows)):
         return []
     grouping = Grouping(("planner",), HEADLINE, rank_by=RANKED_BY, count="episodes")
@@ -211,7 +211,7 @@ def _policies_as_one(
 
 
 def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
-    """The charts of one task, whose name they have if there are several; of trainings."""
+    """Make the charts of one task, with the policies of a training drawn as one planner."""
     rows = policies_together(finished(rows)) or rows
     ranking = Grouping(("planner",), (RANKED_BY,), rank_by=RANKED_BY).table(rows)
     best = [str(line["planner"]) for line in ranking.rows]
@@ -225,7 +225,7 @@ def _charts(rows: Sequence[Row], task: str) -> list[Chart]:
     looks = max((row["result"]["looks_at_steps"] for row in finished(rows)), key=len)
     scores = [quartile_band(label(n), looks, runs(n, "f_score_5cm_over_steps")) for n in best]
     errors = [
-        # Nothing is off at step 0, which a logarithmic axis does not show.
+        # The error at step 0 is zero, which a logarithmic axis cannot show.
         quartile_band(label(n), looks[1:], [ate[1:] for ate in ates], _FLOOR_M)
         for n in best
         if (ates := runs(n, "ate_over_steps"))  # older rows have none

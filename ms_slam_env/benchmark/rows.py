@@ -1,4 +1,4 @@
-"""Run what is missing of an experiment in parallel, then write all that is made of the rows."""
+"""Run the missing rows of an experiment in parallel, then write its results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ms_slam_env.report.results import RESULTS, Results, write_result_folder
 from ms_slam_env.report.tables import finished
 
 RECORDS = "rows.jsonl"
-_NAMING = ("planner", "scene", "sequence", "backend", "seed")  # what a person calls the work by
+_NAMING = ("planner", "scene", "sequence", "backend", "seed")  # fields that always name a row
 
 
 def run_all(
@@ -45,27 +45,27 @@ def run_all(
     environment: Mapping[str, str] | None = None,
     kind: str = "",
 ) -> list[Row]:
-    """Run every spec once, in parallel, and return one row for each, in the order of ``specs``.
+    """Run every spec once, in parallel; return one row for each, in the order of ``specs``.
 
-    One that is given twice has one row: twice it would count twice.
+    A spec given twice has one row, so that it does not count twice.
 
-    Rows that an earlier call left in ``out`` are taken from there, except failed ones, which are
-    tried again, and those whose numbers an algorithm of today would make otherwise, or that were
-    made when a file that they name held something else. A row has ``key``, ``spec``, ``result``
-    (what ``run`` returned, None if it raised or its process died), ``error`` (None or the message),
-    ``elapsed_s``, ``commit`` (of the code that made it), ``results_version`` and ``files`` (hashes
-    by name).
+    Rows that an earlier call left in ``out`` are reused, except those that failed, those made by an
+    algorithm that has changed since, and those that name a file whose content has changed. A row
+    has ``key``, ``spec``, ``result`` (the return value of ``run``, None if it raised or its process
+    died), ``error`` (None or the message), ``elapsed_s``, ``commit`` (of the code that made it),
+    ``results_version`` and ``files`` (hashes by name).
 
     Args:
-        specs: dataclasses; the key of the work is made of all their fields.
+        specs: dataclasses; all their fields together make the key of a row.
         run: a function that a new process can import.
         out: folder of the results.
-        workers: processes, each of one thread; None for one a core.
-        description: shown at the progress bar.
+        workers: number of processes, of one thread each; None for one per core.
+        description: label of the progress bar.
         ray: address of a Ray cluster whose workers run the specs; None: processes of this machine.
-        fresh: whether each spec has a process of its own.
-        environment: variables of the processes; None: one thread each, unless set already.
-        kind: of the result, by which it is known what has changed since a row was made.
+        fresh: whether each spec runs in a new process.
+        environment: environment variables of the processes; None: one thread each, unless already
+            set.
+        kind: kind of the result, used to look up what has changed since a row was made.
 
     Raises:
         InputError: fewer than one worker, no Ray or no cluster at the address, a folder that cannot
@@ -120,7 +120,7 @@ def run_all(
 
 
 def failures(rows: Sequence[Row]) -> list[str]:
-    """The errors among ``rows``, one line each."""
+    """List the errors among ``rows``, one line each."""
     failed = [row for row in rows if row["error"] is not None]
     if not failed:
         return []
@@ -129,7 +129,7 @@ def failures(rows: Sequence[Row]) -> list[str]:
 
 
 def lost_runs(rows: Sequence[Row]) -> list[str]:
-    """The runs over sequences, with ``frames`` and ``lost_share``, that were lost all along."""
+    """List the runs that were lost throughout; each result has ``frames`` and ``lost_share``."""
     found = []
     for row in finished(rows):
         frames, share = row["result"]["frames"], row["result"]["lost_share"]
@@ -141,9 +141,9 @@ def lost_runs(rows: Sequence[Row]) -> list[str]:
 
 
 def names(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Words for pieces of work, given and returned by key.
+    """Name specs for messages, by key.
 
-    As in ``planner greedy, scene table, seed 2000``, then what else differs among them.
+    As in ``planner greedy, scene table, seed 2000``, then other fields that differ among them.
     """
     every = list(dict.fromkeys(name for spec in specs.values() for name in spec))
     shown = [
@@ -159,10 +159,10 @@ def names(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
 
 
 def check_any_finished(rows: Sequence[Row]) -> None:
-    """Refuse to go on where all work failed, so that no good report is overwritten by an empty one.
+    """Refuse to continue if all rows failed, so that an empty report never replaces a good one.
 
     Raises:
-        RuntimeError: with the first error.
+        RuntimeError: quotes the first error.
     """
     errors = failures(rows)
     if rows and len(errors) == len(rows):
@@ -170,7 +170,7 @@ def check_any_finished(rows: Sequence[Row]) -> None:
 
 
 def _row(outcome: Done, spec: Any) -> Row:
-    """An outcome as it is recorded."""
+    """Convert an outcome to the row that is recorded."""
     row: Row = {
         "key": outcome.key,
         "spec": dataclasses.asdict(spec),
@@ -184,11 +184,12 @@ def _row(outcome: Done, spec: Any) -> Row:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run of an experiment came to.
+    """Outcome of running an experiment.
 
     Attributes:
-        results: as written.
-        failures: errors of the rows that failed and complaints of the others, one line each.
+        results: results, as written.
+        failures: errors of failed rows and complaints about runs that were lost throughout, one
+            line each.
     """
 
     results: Results
@@ -198,18 +199,18 @@ class Outcome:
 def run_experiment(
     experiment: Experiment, out: Path, workers: int | None = None, ray: str | None = None
 ) -> Outcome:
-    """Run the rows that ``out`` does not hold yet; write ``results.json``, ``table.md``, figures.
+    """Run the rows that ``out`` lacks; write ``results.json``, ``table.md`` and figures.
 
     Args:
-        experiment: with its options.
-        out: folder of the results; finished rows stand there at once, in ``rows.jsonl``.
-        workers: processes; None for the experiment's own default.
+        experiment: experiment with its options.
+        out: folder of the results; each finished row is saved there at once, in ``rows.jsonl``.
+        workers: number of processes; None for the experiment's default.
         ray: address of a Ray cluster whose workers run the rows; None: processes of this machine.
 
     Raises:
-        InputError: options that no row could be run with, no cluster at the address, or another
-            process that works in ``out``.
-        RuntimeError: every row failed; the files of an earlier run are left as they are.
+        InputError: options with which no row could run, no cluster at the address, or another
+            process working in ``out``.
+        RuntimeError: every row failed; the files of an earlier run stay unchanged.
     """
     specs = experiment.specs()
     if not specs:
@@ -239,9 +240,9 @@ def _run_specs(
 
 
 def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results:
-    """Write everything that is made of the rows into folder ``out``."""
-    # Where in the code a row failed is for who runs it, with the paths of that machine; the version
-    # is that of the whole, and what files held tells whether a row is to be made again.
+    """Write the results made from the rows into folder ``out``."""
+    # Left out: tracebacks hold local paths, the results have one version for all rows, and file
+    # hashes only decide whether a row must be made again.
     left_out = ("traceback", "results_version", "files")
     rows = [{k: v for k, v in row.items() if k not in left_out} for row in rows]
     rows = from_plain(to_plain(rows))
@@ -265,7 +266,7 @@ def _kind(experiment: Experiment) -> str:
 
 
 def as_config(experiment: Any) -> dict[str, Any]:
-    """The options of an experiment as JSON's types."""
+    """Return the options of an experiment as JSON types."""
     names = [field.name for field in dataclasses.fields(experiment)]
     return {name: to_plain(getattr(experiment, name)) for name in names}
 
@@ -276,10 +277,10 @@ _IN_MODULE = re.compile(r"[\w.]+:[\w.]+")
 
 
 def file_hashes(spec: Any) -> dict[str, str]:
-    """Hashes of the files that planner, scene and backend of a spec name, by the name.
+    """Hash the files named by a spec's planner, scene and backend; return the hashes by name.
 
-    Options are looked through, too, as in ``policy,path=FILE``; ``module:Class`` names the source
-    of the module, which may have imported what is not looked at. Folders count for nothing.
+    Options such as ``policy,path=FILE`` are included; ``module:Class`` names the source file of the
+    module, without what it imports. Folders are ignored.
     """
     texts = [getattr(spec, name, None) for name in _FILE_NAMING]
     parts = [
@@ -293,7 +294,7 @@ def file_hashes(spec: Any) -> dict[str, str]:
 
 
 def digest(path: Path) -> str:
-    """Of a file's bytes; empty where there is none, or it cannot be read."""
+    """Return a digest of a file's bytes; empty if it is missing or cannot be read."""
     with suppress(OSError):
         found = path.stat()
         return _digest(path.resolve(), found.st_mtime_ns, found.st_size)
@@ -307,7 +308,7 @@ def _digest(path: Path, _mtime: int, _size: int) -> str:
 
 
 def _file(part: str) -> Path | None:
-    """The file that a part of a text names, if it does."""
+    """Return the file that a part of a text names, if any."""
     with suppress(OSError, ValueError):  # a name too long, with a null byte
         if ("/" in part or "." in part) and Path(part).is_file():
             return Path(part)

@@ -1,4 +1,4 @@
-"""The eight sequences of the USME framework, SLAM backends judged by all of its measures."""
+"""SLAM backends on the eight sequences of the USME framework, with all of its metrics."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
 
 
 _OPTIONS: Mapping[str, Any] = {"image_size": "160x120", "seed": 2000, "frames_scale": 1.0}
-"""What a sequence without a folder is made with, unless told otherwise."""
+"""Default options for rendering a sequence that has no folder."""
 
 
 @dataclass(frozen=True)
@@ -70,20 +70,20 @@ class Usme(Experiment, Checked):
     """
 
     folder: tyro.conf.Positional[Path | None] = None
-    """Folder that ms-slam usme make wrote; without it every frame is rendered when it is needed."""
+    """Folder written by ms-slam usme make; without it frames are rendered on demand."""
     backends: tuple[str, ...] = (
         *("surfel", "surfel,loop_closure=deformation"),
         *("sparse", "volumetric", "kinectfusion", "odometry"),
     )
     """NAME, parameters appended as in surfel,loop_closure=deformation."""
     sequences: tuple[str, ...] = ()
-    """Their names; by default all, or those that the folder holds."""
+    """Names of the sequences; by default those in the folder, or all."""
     image_size: str | None = None
-    """Such as 160x120; by default that of the folder, or this."""
+    """Size of the images, such as 160x120; by default that of the folder, or 160x120."""
     seed: int | None = bounded(None, 0, 2**32 - 1)
-    """Of scenes, paths, noise and perturbations; by default that of the folder, or 2000."""
+    """Seed of scenes, paths, noise and perturbations; by default that of the folder, or 2000."""
     frames_scale: float | None = bounded(None, 0.002, 10.0)
-    """Share of the frames that the same paths take: 0.5 halves the work and doubles the camera's
+    """Scale of the number of frames on the same paths: 0.5 halves the work and doubles the camera's
     speed; by default that of the folder, or 1."""
 
     workers = 1
@@ -91,20 +91,20 @@ class Usme(Experiment, Checked):
     tracks = True
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be rendered."""
+        """Refuse unknown sequences and image sizes."""
         super().__post_init__()
         check_suite(self.sequences or NAMES, self.image_size or _OPTIONS["image_size"])
 
     def environment(self) -> Mapping[str, str]:
-        """One thread a run."""
+        """Limit each run to one thread."""
         return thread_environment(1)
 
     def specs(self) -> list[UsmeSpec]:
-        """Every run.
+        """List every run.
 
         Raises:
-            InputError: an unknown backend or parameter, or a folder that lacks a sequence or holds
-                another.
+            InputError: an unknown backend or parameter, or a folder that lacks a sequence or was
+                made with other options.
         """
         for text in self.backends:
             slam.check_parameters(*parse_named(text, "backend"))
@@ -116,13 +116,13 @@ class Usme(Experiment, Checked):
         ]
 
     def _names(self) -> tuple[str, ...]:
-        """The sequences: those asked for, those that the folder holds, or all."""
+        """Return the requested sequences, else those in the folder, else all."""
         if self.sequences or self.folder is None:
             return self.sequences or NAMES
         return tuple(name for name in NAMES if (self.folder / name).is_dir()) or NAMES
 
     def _options(self, name: str) -> dict[str, Any]:
-        """What a sequence is made with, as its folder says where there is one."""
+        """Return the options that a sequence is made with; those of its folder if there is one."""
         folder = None if self.folder is None else self.folder / name
         made = _OPTIONS if folder is None else made_with(folder)
         for key, value in made.items():
@@ -140,7 +140,7 @@ class Usme(Experiment, Checked):
         return run_usme(spec)
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """The sequences that were run, then a table for each family of measures."""
+        """Tabulate the sequences that were run, then each family of metrics."""
         names = {row["spec"]["sequence"] for row in rows}
         entries = [
             {
@@ -169,7 +169,7 @@ class Usme(Experiment, Checked):
         return tables
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Errors and losses of every backend on every sequence, and the paths beside the truth."""
+        """Plot errors and losses of each backend on each sequence, and the paths with the truth."""
         return [_errors(rows), _paths(rows)]
 
 
@@ -188,7 +188,7 @@ def _errors(rows: Sequence[Row]) -> Chart:
 
 
 def _paths(rows: Sequence[Row]) -> Chart:
-    """USME's figure 8: every sequence from above."""
+    """Plot every sequence from above, as in USME's figure 8."""
     panels = []
     for sequence in dict.fromkeys(row["spec"]["sequence"] for row in finished(rows)):
         own = [row for row in finished(rows) if row["spec"]["sequence"] == sequence]
@@ -206,7 +206,7 @@ def check_suite(sequences: Sequence[str], image_size: str) -> None:
     """Refuse unknown sequences and sizes.
 
     Raises:
-        InputError: naming the valid choices.
+        InputError: lists the valid choices.
     """
     if not sequences:
         raise InputError("Usme.sequences is empty")
@@ -228,16 +228,16 @@ LARGE_OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "kinectfusion": {"depth_cutoff_m": 10.0, "volume_size_m": 20.0},
     "sparse": {"depth_cutoff_m": 10.0},
 }
-"""Options that a backend needs in a large scene, beside what the user asks for.
+"""Options that a backend needs in a large scene, in addition to the user's.
 
-The defaults of the backends are for a Kinect in a room; streets and halls need a farther cut-off,
-and the surfel SLAM widths of its filters that fit the noise of the camera there: with its own it
-was lost 66 frames into a city street (seed 1000, 160x120), with these never.
+The backends' defaults suit a Kinect in a room. Streets and halls need a farther cut-off, and the
+surfel SLAM needs filter widths that fit the noise of the camera there: with its defaults it was
+lost 66 frames into a city street (seed 1000, 160x120), with these never.
 """
 
 _WARM_UP = 5  # frames left out of the timing: buffers grow, kernels are loaded
-_LOOP_VIEW_SIZE = "80x60"  # of the true depth by which places are seen again
-_PATH_POINTS = 200  # of a path, that are drawn
+_LOOP_VIEW_SIZE = "80x60"  # of the true depth used to find revisited places
+_PATH_POINTS = 200  # drawn per path
 _VIEW_EVERY_M = 1.5  # along the true path, for the true surface
 _VIEW_SIZE = "320x240"
 _MOST_VIEWS = 150
@@ -246,15 +246,15 @@ _MOST_POINTS = 1_000_000
 
 @dataclass(frozen=True)
 class UsmeSpec:
-    """A backend on a sequence.
+    """One run of a backend on a sequence.
 
     Attributes:
         sequence: its name in the suite.
-        backend: ``NAME`` or ``NAME,parameter=value,...``, beside what the scene needs.
+        backend: ``NAME`` or ``NAME,parameter=value,...``, added to the scene's options.
         image_size: such as 160x120.
-        seed: of scene, path, noise and perturbations.
-        frames_scale: share of the frames that the same path takes.
-        folder: of the rendered sequence; None renders the frames as they are needed.
+        seed: seed of scene, path, noise and perturbations.
+        frames_scale: scale of the number of frames on the same path.
+        folder: folder of the rendered sequence; None renders the frames on demand.
     """
 
     sequence: str
@@ -269,12 +269,12 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
     """Track a sequence from its true first pose and measure.
 
     Returns:
-        metrics by key, None where a measure does not apply or cannot be had. Accuracy: USME
-        equations 1 to 5, the last pose's error over the path, the finished map's poses. Map, after
-        outlier removal (6) and ICP: distances, ``hausdorff_directed_m`` (7, what the map has too
-        much), ``recall_near``, ``noise_ratio`` (8). Robustness (9 to 11, infinite: never found
-        again), and of a backend that closes loops all of ``loop_measures``. Start (12, 13). Cost:
-        all of ``CostMeter.summary``. Paths, to be drawn.
+        metrics by key, None where a metric does not apply or cannot be computed. Accuracy: USME
+        equations 1 to 5, the last pose's error relative to the path length, the poses of the
+        finished map. Map, after outlier removal (6) and ICP: distances, ``hausdorff_directed_m``
+        (7, spurious points of the map), ``recall_near``, ``noise_ratio`` (8). Robustness (9 to 11,
+        infinite: never relocalised) and, for a backend that closes loops, all of ``loop_measures``.
+        Initialisation (12, 13). Cost: all of ``CostMeter.summary``. Paths for plotting.
     """
     entry = find(spec.sequence)
     scene = scenes.make(entry.scene, spec.seed)
@@ -330,7 +330,7 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
 
 
 def slam_options(sequence: UsmeSequence, backend: str) -> dict[str, Any]:
-    """Options of ``backend``: those of large scenes, and a mask where something moves."""
+    """Return the options of ``backend``: those of large scenes, and a mask for moving objects."""
     is_large = sequence.scene in scenes.LARGE_SCENES
     options = dict(LARGE_OPTIONS.get(backend, {})) if is_large else {}
     if backend == "surfel" and any(t.startswith("moving-objects") for t in sequence.perturbations):
@@ -345,7 +345,7 @@ def _positions(name: str, poses: Float64) -> dict[str, list[float]]:
 def _loop_measures(
     run: SequenceRun, scene: Scene, truth: Float64, options: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Precision and recall of the loops of a run, by true views without moving objects."""
+    """Measure precision and recall of a run's loops, by true views without moving objects."""
     from ms_slam_env.sensor import RGBDSensor
 
     sensor = RGBDSensor(scene, xtion(_LOOP_VIEW_SIZE), noise="none")
@@ -361,11 +361,11 @@ def _reach_m(options: Mapping[str, Any]) -> float:
 
 
 def _frames(sequence: RenderedSequence, folder: str | None) -> Iterator[RGBDFrame]:
-    """The frames, from a folder if there is one.
+    """Yield the frames, from a folder if there is one.
 
     Raises:
-        InputError: the folder holds another number of frames than the sequence has, or none with a
-            depth reading.
+        InputError: the folder holds a different number of frames than the sequence, or no frame
+            with a depth reading.
     """
     from ms_slam_env.sequences.recording import open_recording, recorded_sequence
 
@@ -393,7 +393,7 @@ def _robustness(poses: Float64, truth: Float64, tracked: NDArray[np.bool_]) -> f
 
 
 def _seen_surface(scene: Scene, poses: Float64, options: dict[str, Any]) -> Float64:
-    """True surface (M, 3) that the camera saw within the reach of SLAM, moving objects left out."""
+    """Return the true surface (M, 3) seen within SLAM's depth range, without moving objects."""
     from ms_slam_env.sensor import RGBDSensor
 
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
@@ -411,12 +411,12 @@ def _seen_surface(scene: Scene, poses: Float64, options: dict[str, Any]) -> Floa
 
 
 def voxel_m(scene: str) -> float:
-    """Edge of the voxels in which clouds keep one point: by them a surface counts by its area."""
+    """Return the voxel edge for downsampling clouds, which makes a surface count by its area."""
     return 0.05 if scene in scenes.LARGE_SCENES else 0.01
 
 
 def map_measures(points: Float64, surface: Float64, scene: str) -> dict[str, Any]:
-    """Measures of the map (N, 3) against the true surface (M, 3); see `run_usme`."""
+    """Measure the map (N, 3) against the true surface (M, 3); see `run_usme`."""
     near = 5 * voxel_m(scene)
     nothing = dict.fromkeys(
         ("c2c_mean_m", "c2c_std_m", "hausdorff_directed_m", "recall_near", "noise_ratio")

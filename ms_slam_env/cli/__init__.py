@@ -1,4 +1,4 @@
-"""The command line ``ms-slam``; each command is imported only when it is called."""
+"""The command line ``ms-slam``; each command is imported only when it runs."""
 
 from __future__ import annotations
 

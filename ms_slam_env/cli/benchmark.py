@@ -1,4 +1,4 @@
-"""``ms-slam benchmark``: the experiment ``planners`` under the name that everybody looks for."""
+"""``ms-slam benchmark``: the experiment ``planners`` under its familiar name."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ from ms_slam_env.cli.experiment import run
 def main(arguments: Sequence[str]) -> int:
     """Run the benchmark; 1 if an episode failed.
 
-    An interrupted run goes on from where it was when the same command is given again.
+    Repeat the same command to resume an interrupted run.
     """
     return run(PlannerBenchmark, arguments, "ms-slam benchmark", Path("results/benchmark"))

@@ -12,6 +12,6 @@ from ms_slam_env.cli.experiment import run
 def main(arguments: Sequence[str]) -> int:
     """Run the comparison; 1 if a run failed.
 
-    An interrupted comparison goes on from where it was when the same command is given again.
+    Repeat the same command to resume an interrupted comparison.
     """
     return run(Compare, arguments, "ms-slam compare", Path("results/compare"))

@@ -14,22 +14,22 @@ from ms_slam_env._runtime.command_line import parse
 
 @dataclass(frozen=True)
 class Arguments:
-    """How hard sequences are: divergence from frame to frame, as in the paper's Table I.
+    """Measure how hard sequences are: frame-to-frame divergence, as in the paper's Table I.
 
-    Layouts are those of ms-slam run. Writes divergence.json, table.md and divergence.png.
+    Accepts the layouts of ms-slam run. Writes divergence.json, table.md and divergence.png.
     """
 
     sequences: tyro.conf.Positional[tuple[str, ...]]
     """Folders of recordings, or scene:seed[:word[+word ...]]."""
     image_size: str = "native"
-    """Reduce the images to this size, such as 160x120, or 160x120+crop for their largest central
-    part of that aspect."""
+    """Reduce the images to this size, such as 160x120; 160x120+crop first crops them centrally to
+    that aspect ratio."""
     layout: str = "auto"
     """auto, tum, icl-nuim, 7-scenes, folder, euroc, kitti or bag."""
     every: int = 1
     """Take every n-th frame."""
     paper: bool = False
-    """The paper's histograms (256 levels, no smoothing) in place of this package's defaults."""
+    """Use the paper's histograms (256 levels, no smoothing) instead of this package's defaults."""
     measure: str = "kl"
     """kl (the paper's), windowed-kl, earth-movers (exact), or wasserstein: how far observations of
     the same surface move (Saeedi et al., ICRA 2019; needs true poses)."""

@@ -31,8 +31,8 @@ class Arguments:
     check: bool = False
     """Change nothing; exit with 1 if a page is out of date."""
     pack: tuple[Path, Path] | None = None
-    """A folder that --out named, and the one of docs/results that is to hold it, compressed; files
-    that are in both, as a picture that a page shows, are renewed. No page is written."""
+    """Compress a folder written with --out into a folder of docs/results: SOURCE TARGET. Files that
+    are in both, such as a picture shown on a page, are replaced. No page is written."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def pages_of(root: Path) -> tuple[Path, ...]:
-    """The pages of a clone; Markdown in a folder of docs/results is no page."""
+    """List the pages of a clone, without the Markdown in folders of docs/results."""
     results = root / "docs" / "results"
     found = [root / name for name in _PAGES if (root / name).is_file()]
     found += [

@@ -22,9 +22,9 @@ class Arguments:
     """Compare an estimated trajectory, a map, or both with the truth.
 
     Trajectories are TUM files: timestamp tx ty tz qx qy qz qw, camera to world. Maps are PLY files
-    (or OBJ, glTF, STL, OFF): clouds as they are, meshes sampled. With --out, writes
-    evaluation.json, table.md and figures, and the poses that correspond, aligned,
-    as evaluation.estimate.txt and evaluation.truth.txt.
+    (or OBJ, glTF, STL, OFF); point clouds are used directly, meshes are sampled. With --out, writes
+    evaluation.json, table.md, figures, and the matched, aligned poses as evaluation.estimate.txt
+    and evaluation.truth.txt.
     """
 
     estimate: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="ESTIMATE")] = None
@@ -34,12 +34,12 @@ class Arguments:
     ] = None
     """True trajectory."""
     runs: tuple[str, ...] = ()
-    """Many estimates against one --truth, as FILE or NAME=FILE; those of one name are runs of one
-    system, of which medians with intervals and box plots are given."""
+    """Estimates to compare with one --truth, as FILE or NAME=FILE. Files that share a NAME are runs
+    of one system, reported as medians with intervals and box plots."""
     truth: Path | None = None
     """True trajectory of --runs."""
     deltas: tuple[float, ...] = ()
-    """Of --runs: relative errors are given over each of these."""
+    """Deltas over which --runs reports relative errors."""
     tables: tuple[str, ...] = ()
     """Write the tables also as latex, csv, or both (with --out)."""
     rerun: bool = False
@@ -48,56 +48,57 @@ class Arguments:
     """Alignment for ATE: se3, sim3 (relative errors are then of the scaled estimate), yaw (rotation
     about the world's z axis and translation), origin (first pose onto first) or none."""
     align_first: int | None = None
-    """Align by so many poses from the start alone (se3, sim3, yaw)."""
+    """Align using only this many poses from the start (se3, sim3, yaw)."""
     delta: float = 1
-    """How far apart the poses of a relative error are."""
+    """Distance between the two poses of a relative error."""
     delta_unit: str = "frames"
     """Unit of --delta: frames, m (along the true path) or s."""
     pairs: str = "all"
-    """Pairs of poses for relative errors: all, or consecutive (each begins where one ends)."""
+    """Pose pairs for relative errors: all, or consecutive (each starts where the last one ends)."""
     tolerance: float = 0.1
-    """Of a delta in m or s over all pairs, as a share of it."""
+    """Tolerance for a delta in m or s over all pairs, as a fraction of the delta."""
     segments: int = 1
-    """Errors are also given for so many equal pieces of the trajectory."""
+    """Also report errors for this many equal segments of the trajectory."""
     segment_lengths_m: tuple[float, ...] = ()
     """Lengths of sub-trajectories for drift, as in KITTI; by default a tenth to a half of the
     path."""
     max_difference_s: float = 0.02
-    """Largest difference between timestamps that correspond."""
+    """Largest difference between matching timestamps."""
     gap_s: float | None = None
-    """An estimate without poses for longer was lost in between; by default three times the median
+    """Count a longer gap between poses of the estimate as lost; by default three times the median
     interval."""
     frames: Path | None = None
-    """frames.csv of ms-slam run: leave out the poses of frames that were not tracked. One that lies
-    beside ESTIMATE leaves none out, but adds the error of tracked frames alone."""
+    """frames.csv of ms-slam run: leave out the poses of untracked frames. A frames.csv beside
+    ESTIMATE is read without this option; it leaves out no pose and adds the error of tracked frames
+    alone."""
     map: Path | None = None
     """Estimated map."""
     true_map: Path | None = None
-    """True surface; or a sequence's folder, for what its depth shows from its true poses."""
+    """True surface; or the folder of a sequence, whose depth and true poses give the surface."""
     register: str = "none"
     """Bring the map onto the true one first: none, icp, plane-icp or gicp."""
     cutoff_m: float = 0.5
-    """Pairs of points farther apart do not count in that."""
+    """Registration ignores point pairs farther apart than this."""
     thresholds_m: tuple[float, ...] = (0.02, 0.05)
-    """For precision, recall and F-score of the map."""
+    """Distance thresholds for precision, recall and F-score of the map."""
     voxel_m: float = 0.01
-    """Maps keep one point a voxel of this side; 0 keeps all."""
+    """Downsample maps to one point per voxel of this edge length; 0 keeps all points."""
     samples: int = 200_000
-    """Points taken from a mesh."""
+    """Number of points sampled from a mesh."""
     remove_outliers: bool = False
-    """Statistically, from the estimated map, before it is compared."""
+    """Remove statistical outliers from the estimated map before comparing it."""
     neighbours: int = 20
-    """Of a point in the statistics of outliers."""
+    """Neighbours of each point for statistical outlier removal."""
     std_ratio: float = 2.0
-    """Standard deviations above the mean that make an outlier."""
+    """Standard deviations above the mean beyond which a point is an outlier."""
     two_sided: bool = False
-    """Points closer together than so many below the mean are outliers, too, as USME has it."""
+    """Also remove points that many standard deviations below the mean, as USME does."""
     out: Path | None = None
     """Folder of the results."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print what was measured, and write it."""
+    """Measure, print the results and, with --out, write them."""
     args = parse(Arguments, arguments, "ms-slam evaluate")
     if (args.estimate is None) != (args.groundtruth is None):
         raise InputError("Missing GROUNDTRUTH: trajectories are given as ESTIMATE GROUNDTRUTH")
@@ -123,7 +124,7 @@ def main(arguments: Sequence[str]) -> int:
     from ms_slam_env.report.table_files import check_formats
 
     check_formats(args.tables)
-    # Nothing is written before everything has been measured: bad input leaves no half of a result.
+    # Write only after everything is measured, so that bad input leaves no partial result.
     parts = []
     if args.truth is not None:
         options = _trajectory_options(args)
@@ -148,7 +149,7 @@ _OF_MAPS = (
 
 
 def _refuse_given(args: Arguments, name: str, needed: str) -> None:
-    """Refuse an option that would change nothing."""
+    """Refuse an option that would have no effect."""
     if getattr(args, name) != getattr(Arguments, name):
         raise InputError(f"--{name.replace('_', '-')} needs {needed}")
 

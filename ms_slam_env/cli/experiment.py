@@ -25,7 +25,7 @@ ELSEWHERE = "the research of the project is not installed: clone it and pip inst
 
 
 def main(arguments: Sequence[str]) -> int:
-    """List the experiments, or run one; 1 if a row failed or a committed figure differs."""
+    """List the experiments, or run one; return 1 if a row failed or a committed value differs."""
     if not arguments or arguments[0] in ("list", "-h", "--help"):
         print(listing())
         return 0 if arguments else 2
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def run(cls: type[Experiment], arguments: Sequence[str], program: str, out: Path) -> int:
-    """Parse the options of an experiment, run it into ``out`` or where they say, print tables."""
+    """Parse an experiment's options, run it and print its tables; ``out`` is the default folder."""
     args: Any = parse(with_run_options(cls, out), arguments, program)
     if args.check:
         return check(cls, args.committed)
@@ -47,7 +47,7 @@ def run(cls: type[Experiment], arguments: Sequence[str], program: str, out: Path
 
 
 def check(cls: type[Experiment], folder: Path) -> int:
-    """Compare some committed rows with what the code makes of them today."""
+    """Run some committed rows again and compare; return 1 if a value differs."""
     committed = read_results(folder / RESULTS)
     if committed.caveats:
         print(committed.caveats)
@@ -57,7 +57,7 @@ def check(cls: type[Experiment], folder: Path) -> int:
 
 
 def with_run_options(cls: type[Experiment], out: Path) -> type[Any]:
-    """The experiment's dataclass with the options that every experiment has."""
+    """Extend the experiment's dataclass with the options common to all experiments."""
     name = cls.__module__.rpartition(".")[2]
     options: list[tuple[str, Any, str, Any]] = [
         ("workers", int | None, "Parallel processes (default: the experiment's own).", None),
@@ -83,7 +83,7 @@ def with_run_options(cls: type[Experiment], out: Path) -> type[Any]:
 
 
 def listing() -> str:
-    """Every experiment and what it is."""
+    """List every experiment with its title."""
     names = EXPERIMENTS.names()
     width = max(map(len, names))
     return "\n".join(

@@ -11,11 +11,11 @@ from ms_slam_env._runtime.command_line import parse, report_failures
 
 @dataclass(frozen=True)
 class Arguments:
-    """Search the design space of a SLAM backend for the best compromises of error and cost.
+    """Search the design space of a SLAM backend for the best trade-offs of error and cost.
 
-    The default configuration is the first trial. May be killed and called again with the same
-    arguments at any time: finished trials are kept. Writes explore.json, table.md, figures and the
-    chosen configurations as YAML.
+    The default configuration is the first trial. Repeat the same command to resume at any time:
+    finished trials are kept. Writes explore.json, table.md, figures and the chosen configurations
+    as YAML.
     """
 
     sequences: tuple[str, ...] = (
@@ -26,13 +26,13 @@ class Arguments:
     )
     """Sequences to explore on: folders, or scene:seed[:word[+word ...]]."""
     held_out: tuple[str, ...] = ()
-    """Sequences to judge the front and the chosen configurations on."""
+    """Sequences to test the front and the chosen configurations on."""
     objectives: tuple[str, ...] = ("ate_m", "ext_ms")
-    """What to minimise: ate_m, ate_max_m, ate_worst_m (of all sequences), ate_worst_ratio (to the
-    default's), ext_ms, load_ms, mem_mb, energy_j, energy_model_j,
-    map_error_mm, lost; M_I and M_D are maximised."""
+    """Objectives to minimise: ate_m, ate_max_m, ate_worst_m (of all sequences), ate_worst_ratio (to
+    the default's), ext_ms, load_ms, mem_mb, energy_j, energy_model_j, map_error_mm, lost; M_I and
+    M_D are maximised."""
     constraints: tuple[str, ...] = ()
-    """What to demand, as in "ate_m<0.01", "M_I<0.02" or "M_I>0.02"."""
+    """Constraints, as in "ate_m<0.01", "M_I<0.02" or "M_I>0.02"."""
     parameters: tuple[str, ...] = ("algorithm",)
     """Parameters of the backend: NAME, NAME=low:high[:log], NAME=a,b,c; keep_every, image_size,
     pyramid_levels; or a group: paper, algorithm, frame, compiler, machine, kinectfusion."""
@@ -41,31 +41,34 @@ class Arguments:
     sampler: str = "tpe"
     """random, nsga2, tpe, gp or forest (random forests, as HyperMapper does)."""
     trials: int = 100
-    """Finished trials, those of earlier calls included."""
+    """Total number of finished trials, including those of earlier calls."""
     seed: int = 0
-    """Of the sampler."""
+    """Seed of the sampler."""
     workers: int = 1
     """Processes that share the trials."""
     ray: str | None = None
     """Address of a Ray cluster to use, such as "auto"; "local" for one on this machine."""
     image_size: str = "160x120"
-    """Of the camera, where the configuration does not say."""
+    """Image size, unless the configuration sets one."""
     frames: int = 90
-    """Length of a rendered sequence."""
+    """Number of frames of a rendered sequence."""
     speed_m_s: float = 0.5
-    """Mean speed of the camera of a rendered sequence, where it does not turn."""
+    """Mean speed of the camera in a rendered sequence, while it does not turn."""
     turn_deg_s: float = 30.0
-    """Mean speed of rotation, where it turns."""
+    """Mean speed of rotation, while it turns."""
     max_lost: float = 0.02
-    """Share of the frames that tracking may lose; a trial that loses more has failed."""
+    """Largest share of frames that tracking may lose; a trial that loses more fails."""
     clock: str = "processor"
-    """Execution time is processor time of all threads, or "wall" time, which a GPU needs."""
+    """Measure execution time as "processor" time of all threads, or as "wall" time (needed on a
+    GPU)."""
     reference_factor: float = 3.0
-    """Results worse than so many times the default's count as that."""
+    """Reference point of the front's hypervolume, as a multiple of the default's results; worse
+    results count as this."""
     for_divergence: tuple[float, float] | None = None
-    """M_I and M_D of an application, nats: name the best configuration for them, too."""
+    """M_I and M_D of an application, nats; also name the best configuration for them."""
     tolerance: float = 1.2
-    """Times the default's error that this one and the levels of run-time adaptation may have."""
+    """Largest error, as a multiple of the default's, allowed for that configuration and for the
+    levels of run-time adaptation."""
     out: Path = Path("results/explore")
     """Folder of the study and the results."""
 

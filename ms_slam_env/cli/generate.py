@@ -17,7 +17,7 @@ from ms_slam_env.sequences.paths.handheld import HandheldPath
 
 @dataclass(frozen=True)
 class EpisodeOptions:
-    """Episode of a planner; only with --planner."""
+    """Options of a planner's episode; only with --planner."""
 
     steps: int = 100
     """Length of the episode."""
@@ -35,23 +35,23 @@ class EpisodeOptions:
 class Arguments:
     """Render an RGB-D sequence with true poses, in the TUM layout that ms-slam run reads.
 
-    An interrupted run goes on from where it was when the same command is given again; until it is
-    done the folder's name ends in .partial.
+    Repeat the same command to resume an interrupted run; until it is done the folder's name ends in
+    .partial.
     """
 
     scene: str = "living_room"
     """Name of a scene, or a mesh file."""
     seed: int = 0
-    """Of the scene, the path, the noise and the perturbations."""
+    """Seed of the scene, the path, the noise and the perturbations."""
     path: HandheldPath = field(default_factory=HandheldPath)
     """Seeded hand-held path; not used with --trajectory or --planner."""
     route: tuple[str, ...] = ()
     """Walk along these places of a street, hall or home instead, as in SW NW N, or hall kitchen;
     A-B is half-way."""
     trajectory: Path | None = None
-    """Camera motion to place into the scene instead (TUM file)."""
+    """Place this recorded camera motion (TUM file) into the scene instead."""
     scale: float | None = None
-    """Factor on that motion; by default the largest up to 1 that fits."""
+    """Scale of that motion; by default the largest up to 1 that fits."""
     planner: str | None = None
     """Render the motion of this planner's episode instead: NAME or module:Class, options appended
     as in greedy,rho_I=0.3."""
@@ -120,7 +120,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _motion(args: Arguments, recorded: Any, scene: Any) -> tuple[Any, Any, dict[str, Any]]:
-    """Times (N,), poses (N, 4, 4), and what to tell of a placed trajectory or an episode."""
+    """Return times (N,), poses (N, 4, 4), and the description of a placed trajectory or episode."""
     if args.planner is not None:
         return _planned(args, args.planner)
     if args.route:
@@ -138,7 +138,7 @@ def _motion(args: Arguments, recorded: Any, scene: Any) -> tuple[Any, Any, dict[
 
 
 def _planned(args: Arguments, planner: str) -> tuple[Any, Any, dict[str, Any]]:
-    """The same of a planner's episode."""
+    """Return times, poses and description of a planner's episode."""
     from ms_slam_env.benchmark.episodes import (
         EpisodeSpec,
         parse_options,

@@ -36,11 +36,11 @@ _INFOS = (
     *("action_mask", "tracking_ok", "T_world_camera", "T_world_camera_estimate"),
     *("divergence", "pose_error", "mapped_share"),
 )
-"""What is kept of ``info`` at every step."""
+"""Keys of ``info`` recorded at every step."""
 
 _OWN_OPTIONS = ("scene", "split", "num_scene_seeds", "observation")
 _MARKERS = {"minari": "data/metadata.json", "lerobot": "meta/info.json"}
-"""Format to the file that a whole dataset has."""
+"""File that marks a complete dataset, by format."""
 _NEEDS = {"minari": "minari", "lerobot": "pyarrow"}
 
 
@@ -48,8 +48,8 @@ _NEEDS = {"minari": "minari", "lerobot": "pyarrow"}
 class Args(Checked):
     """Record episodes of a planner as a Minari or LeRobot dataset
 
-    ``minari.load_dataset(NAME)`` finds it where the environment variable MINARI_DATASETS_PATH names
-    the folder ``--out``.
+    ``minari.load_dataset(NAME)`` finds it if the environment variable MINARI_DATASETS_PATH points
+    to the ``--out`` folder.
     """
 
     planner: str = "nbv"
@@ -57,30 +57,30 @@ class Args(Checked):
     env_id: str = chosen("MSActiveSLAM-FreeCamera-v0", *ms_slam_env.ENV_IDS)
     """Environment."""
     scenes: tuple[str, ...] = ("living_room", "corridor", "table")
-    """Drawn from in each episode."""
+    """Scenes, one of which is drawn for each episode."""
     seeds: str = "train"
-    """Split of the scenes' seeds: train, validation or test; or your own, as 7000-7003."""
+    """Split of scene seeds: train, validation or test; or your own range, such as 7000-7003."""
     scene_seeds: int = bounded(100, 1, 100_000)
-    """Seeds of each scene, from the split's first."""
+    """Number of seeds for each scene, from the start of the split."""
     episodes: int = bounded(10, 1, 1_000_000)
-    """How many."""
+    """Number of episodes."""
     steps: int = bounded(100, 1, 1_000_000)
     """Time limit of an episode."""
     seed: int = bounded(0, 0, 2**31)
-    """Of the first episode; the next ones follow."""
+    """Seed of the first episode; each later episode adds one."""
     observation: str | None = None
-    """What is recorded; by default what the planner is shown."""
+    """Observation to record; by default the one that the planner sees."""
     options: tuple[str, ...] = ()
     """Further options of the environment, as name=value."""
     format: str = chosen("minari", *_MARKERS)
     """minari, or lerobot: a LeRobotDataset of format v3.0."""
     name: str | None = None
-    """Of the dataset; by default PLANNER-v0."""
+    """Name of the dataset; by default PLANNER-v0."""
     out: Path = field(default=Path("results/record"))
     """Folder of datasets."""
 
     def __post_init__(self) -> None:
-        """Refuse values out of range, and a name that Minari does not know as one."""
+        """Refuse values out of range and names that are not valid Minari dataset names."""
         super().__post_init__()
         if self.name is not None and not re.fullmatch(r"[\w-]+-v\d+", self.name):
             raise InputError(f"name {self.name!r} is not of the form NAME-v0")
@@ -97,9 +97,10 @@ def record(args: Args) -> Path:
     """Play the episodes and write the dataset; return its folder.
 
     Raises:
-        InputError: the format's library is not installed, bad options, or a dataset of this name.
+        InputError: the format's library is not installed, an option is bad, or a dataset of this
+            name exists.
     """
-    if find_spec(_NEEDS[args.format]) is None:  # said here, before any work is done
+    if find_spec(_NEEDS[args.format]) is None:  # fail before any work is done
         raise InputError(
             f"ms-slam record --format {args.format} needs {_NEEDS[args.format]}: "
             "pip install 'ms-slam-env[record]'"
@@ -117,7 +118,7 @@ def record(args: Args) -> Path:
 
 
 def _make(args: Args, name: str) -> None:
-    """Play the episodes in a process of its own; the dataset takes its place at the end."""
+    """Play the episodes in a separate process; move the dataset into place once complete."""
     with (
         kept(f"nothing is left in {args.out / name}"),
         result_folder(args.out, f"{name}/{_MARKERS[args.format]}") as made,
@@ -129,14 +130,14 @@ def _make(args: Args, name: str) -> None:
             raise outcome.value
         if outcome.is_bad_input:
             raise InputError(outcome.message)
-        if outcome.died:  # HDF5 does not survive what it cannot write
+        if outcome.died:  # HDF5 crashes when a write fails
             raise OSError(errno.EIO, "the process that wrote it died", str(made / name))
         if outcome.error:
             raise RuntimeError(outcome.traceback)
 
 
 def _read_by(args: Args, name: str) -> str:
-    """How the dataset is read."""
+    """Describe how to load the dataset in Python."""
     place = str(args.out.resolve())
     if args.format == "lerobot":
         return f": LeRobotDataset({name!r}, root={str(Path(place, name))!r})"
@@ -144,7 +145,7 @@ def _read_by(args: Args, name: str) -> str:
 
 
 def _attempt(job: tuple[Args, str, Path]) -> OSError | None:
-    """Play and write in a process of its own; return what the disk said against it."""
+    """Play and write in a separate process; return the error of a failed write, if any."""
     args, name, folder = job
     try:
         env = _environment(args)
@@ -172,7 +173,7 @@ def _environment(args: Args) -> gym.Env[Any, Any]:
 
 
 def _write_minari(env: gym.Env[Any, Any], args: Args, name: str, folder: Path) -> None:
-    """Play the episodes and write them, one after another, as dataset ``name`` below ``folder``."""
+    """Play the episodes and write them one by one as dataset ``name`` under ``folder``."""
     import minari
     from minari.data_collector import EpisodeBuffer
 
@@ -207,7 +208,7 @@ def _write_minari(env: gym.Env[Any, Any], args: Args, name: str, folder: Path) -
 
 
 def _write_lerobot(env: gym.Env[Any, Any], args: Args, name: str, folder: Path) -> None:
-    """The same as a LeRobotDataset; a step counts as one of the film that an episode makes."""
+    """Play the episodes and write them as a LeRobotDataset, one video frame per step."""
     assert env.spec is not None
     robot = env.spec.kwargs["embodiment"]
     writer = DatasetWriter(folder / name, _told(args), env.metadata["render_fps"], robot)
@@ -222,14 +223,14 @@ def _told(args: Args) -> str:
 
 
 def _episodes(env: gym.Env[Any, Any], args: Args) -> Iterator[tuple[int, Steps]]:
-    """The episodes with their seeds."""
+    """Play the episodes; yield the seed and steps of each."""
     bar = Bar(range(args.seed, args.seed + args.episodes), "episodes", unit="episode")
     for seed in bar:
         yield seed, _play(env, args, seed)
 
 
 def _play(env: gym.Env[Any, Any], args: Args, seed: int) -> Steps:
-    """One episode to its end."""
+    """Play one episode to its end."""
     observation, info = env.reset(seed=seed)
     stream = np.random.default_rng([seed, _STREAM])
     planner = make_planner(args.planner, env.unwrapped, seed=int(stream.integers(2**31)))
@@ -256,7 +257,7 @@ def _has_parts(env: gym.Env[Any, Any]) -> bool:
 
 @contextmanager
 def _datasets_in(folder: Path) -> Iterator[None]:
-    """Let Minari write below ``folder``."""
+    """Make Minari write under ``folder``."""
     before = os.environ.get(_VARIABLE)
     os.environ[_VARIABLE] = str(folder.resolve())
     try:

@@ -16,8 +16,8 @@ from ms_slam_env._runtime.output_files import check_out_file
 class Arguments:
     """Turn a folder of results into one HTML page with interactive figures and sortable tables.
 
-    Takes what the other commands write with --out; a folder of such folders gives one page with a
-    table of contents. The page needs no network and no other file.
+    Reads the --out folder of any other command; a folder of such folders becomes one page with a
+    table of contents. The page works offline and needs no other file.
     """
 
     folder: tyro.conf.Positional[Path]

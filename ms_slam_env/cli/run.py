@@ -32,57 +32,57 @@ class Arguments:
     (depth by stereo matching), ROS bags and MCAP files, or folders depth and rgb with an
     intrinsics.txt of "fx fy cx cy width height [depth_scale] [MODEL k...]", MODEL
     radial-tangential, rational or equidistant. Writes trajectory.txt (TUM), map.ply, metrics.json
-    and frames.csv (what each frame cost).
+    and frames.csv (the cost of each frame).
     """
 
     sequence: tyro.conf.Positional[str]
     """Folder or bag of a recording, or scene:seed[:word[+word ...]] such as
     living_room:2000:kinect+misregistration."""
     config: Path | None = None
-    """Configuration file (YAML): backend, parameters, image size, which frames and threads."""
+    """Configuration file (YAML): backend, parameters, image size, frame selection and threads."""
     backend: str | None = None
-    """SLAM backend; without a configuration file surfel."""
+    """SLAM backend; by default that of the configuration file, else surfel."""
     image_size: str | None = None
-    """Reduce the images to this size, such as 160x120; 160x120+crop takes their largest central
-    part of that aspect, 160x120+crop=480x360 that part. By default that of the configuration file,
+    """Reduce the images to this size, such as 160x120; 160x120+crop first crops them centrally to
+    that aspect ratio, 160x120+crop=480x360 to that size. By default that of the configuration file,
     else "native"."""
     layout: str = "auto"
     """auto, tum, icl-nuim, 7-scenes, folder, replica, euroc, kitti or bag."""
     intrinsics: str | None = None
-    """Of the images on disk, as intrinsics.txt has them; by default those of
+    """Intrinsics of the images on disk, in the format of intrinsics.txt; by default those of
     intrinsics.txt in the folder, else the published ones of the dataset."""
     register: bool | None = None
-    """Bring colour into the depth camera: True as an uncalibrated Kinect needs it, False not; by
+    """Register colour to the depth camera: True, as for an uncalibrated Kinect, or False. By
     default only for 7-scenes and, with their own calibration, for bags and ScanNet."""
     topics: tuple[str, ...] = ()
     """Topics of a bag, as in depth=/camera/depth/image_rect color=/camera/rgb/image_rect
     info=/camera/depth/camera_info pose=/vicon/camera; those left out are found by type and name."""
     params: tuple[str, ...] = ()
-    """Parameters of the backend, as in icp_rgb_weight=0.2; before those of the file."""
+    """Parameters of the backend, as in icp_rgb_weight=0.2; they override those of the file."""
     frame_management: str = "none"
-    """Which frames SLAM processes: none (every frame), regular,every=2, divergence,threshold=0.01,
-    budget,share=0.5 and so on; the poses of the others are predicted."""
+    """Frame selection: none (process every frame), regular,every=2, divergence,threshold=0.01,
+    budget,share=0.5 and so on. The poses of skipped frames are predicted."""
     map_in: Path | None = None
-    """Go on in the map of this file, which --map-out of another run wrote: the camera is sought in
-    it. Backend and parameters are those of the file."""
+    """Resume from the map in this file, written by --map-out of another run; the camera is
+    relocalised in it. Backend and parameters come from the file."""
     map_out: Path | None = None
-    """Write the map to this file, to be gone on with."""
+    """Save the map to this file, to resume from with --map-in."""
     mesh: bool = False
-    """Write mesh.ply, too: Poisson reconstruction of the map (extra open3d)."""
+    """Also write mesh.ply, a Poisson reconstruction of the map (extra open3d)."""
     core_watts: float = 10.0
-    """Watts of a busy core, by which energy is estimated from processor time where neither RAPL nor
-    NVML can be read; the estimate has names of its own (ene_model_j)."""
+    """Watts of a busy core, used to estimate energy from processor time where neither RAPL nor NVML
+    can be read; the estimate is reported separately (ene_model_j)."""
     out: Path = Path("results/run")
     """Folder of the results."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run, write, and print what was measured."""
+    """Run the backend, write the results and print the measurements."""
     args = parse(Arguments, arguments, "ms-slam run")
     if args.backend is not None:
         from ms_slam_env.slam.registry import POINT
 
-        POINT.find(args.backend)  # a typo is answered before all that a run needs is imported
+        POINT.find(args.backend)  # report a typo before the slow imports
     from ms_slam_env._runtime.parallel import limit_threads
     from ms_slam_env.config import from_dict, nested_options
     from ms_slam_env.evaluation.run_sequence import lost_throughout
@@ -160,7 +160,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _say_what_is_missing(sequence: RGBDSequence) -> None:
-    """Say what the sequence has not, so that nobody takes it for given."""
+    """Warn about missing colour and missing true poses."""
     if not sequence.has_color:
         print("no colour: SLAM has depth alone", file=sys.stderr)
     if sequence.true_trajectory() is None:

@@ -19,25 +19,25 @@ from ms_slam_env.sequences.usme_suite import NAMES, make_suite
 class Make(Checked):
     """Render the eight sequences into folders, in the TUM layout that ms-slam run reads.
 
-    An interrupted call goes on from where it was when the same command is given again.
+    Repeat the same command to resume an interrupted call.
     """
 
     out: Path = Path("results/usme_sequences")
-    """Folder that gets one folder a sequence."""
+    """Folder that gets one folder per sequence."""
     truth: bool = False
     """Also write true depth and object labels."""
     sequences: tuple[str, ...] = NAMES
-    """Their names."""
+    """Names of the sequences to render."""
     image_size: str = "160x120"
-    """Such as 160x120."""
+    """Size of the images, such as 160x120."""
     seed: int = bounded(2000, 0, 2**32 - 1)
-    """Of scenes, paths, noise and perturbations."""
+    """Seed of scenes, paths, noise and perturbations."""
     frames_scale: float = bounded(1.0, 0.002, 10.0)
-    """Share of the frames that the same paths take: 0.5 halves the work and doubles the camera's
+    """Scale of the number of frames on the same paths: 0.5 halves the work and doubles the camera's
     speed."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be rendered."""
+        """Refuse unknown sequences and image sizes."""
         super().__post_init__()
         check_suite(self.sequences, self.image_size)
 
@@ -46,7 +46,7 @@ COMMANDS: dict[str, type[Make | Usme]] = {"make": Make, "run": Usme}
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do one of the two; 1 if a run failed."""
+    """Run the chosen subcommand; return 1 if a run failed."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_usage(), file=sys.stdout if arguments else sys.stderr)
         return 0 if arguments else 2

@@ -26,7 +26,7 @@ class Args(Checked):
     """Look inside an episode with the Rerun viewer
 
     Camera, images, map, true and estimated path, arm, divergences against M, reward terms,
-    candidates and the planner's goal, step by step. Without --save a window is opened.
+    candidates and the planner's goal, step by step. Opens a window unless --save is given.
     """
 
     planner: str = "nbv"
@@ -36,9 +36,9 @@ class Args(Checked):
     scene: str = "living_room"
     """Name of a scene, or a mesh file."""
     scene_seed: int = bounded(2000, 0, 2**31)
-    """Of the scene."""
+    """Seed of the scene."""
     seed: int = bounded(0, 0, 2**31)
-    """Of start pose, sensor noise and planner."""
+    """Seed of start pose, sensor noise and planner."""
     steps: int = bounded(100, 1, 1_000_000)
     """Length of the episode."""
     options: tuple[str, ...] = ()
