@@ -102,7 +102,7 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     ``reward_terms``; ``action_mask`` (n,) bool; ``mapped_area`` m2; ``mapped_share`` of the surface
     adjacent to free space, [0, 1]; ``time`` simulated seconds; ``energy`` mechanical work of the
     motion so far, J; ``scene``, ``scene_seed``.
-    Wall-clock timings are in ``env.unwrapped.timings`` instead. Where the agent chooses the SLAM
+    No clock is in it: timings are in ``env.unwrapped.timings``. Where the agent chooses the SLAM
     configuration, ``slam_configuration`` is the current index.
 
     ## Arguments
