@@ -83,7 +83,7 @@ def test_a_buffer_is_the_arrays_own_memory():
 def test_fewer_values_are_broadcast_on_every_device(dtype, device, by_assigning) -> None:
     buffer = HostDeviceBuffer((4, 3), dtype, str(device))
     if by_assigning:  # as on any device that is not the CPU
-        buffer._staged, buffer._memory = buffer.read(), None
+        buffer._values, buffer._is_shared = buffer.read(), False
     shape = buffer.read().shape
     values = np.arange(4).reshape(4, *[1] * (len(shape) - 1))
     buffer.write(values)

@@ -111,9 +111,8 @@ class HostDeviceBuffer:
 
     def __init__(self, shape: int | tuple[int, ...], dtype: Any, device: str) -> None:
         self.array = wp.zeros(shape, dtype=dtype, device=device)
-        values = self.array.numpy()
-        self._memory: NDArray[Any] | None = values if wp.get_device(device).is_cpu else None
-        self._staged: NDArray[Any] = values  # on its way to another device
+        self._values: NDArray[Any] = self.array.numpy()  # on a CPU its memory, else a copy
+        self._is_shared = wp.get_device(device).is_cpu
 
     def write(self, values: ArrayLike) -> None:
         """Set all values; on every device they are broadcast to the shape of the array.
@@ -121,23 +120,21 @@ class HostDeviceBuffer:
         Raises:
             ValueError: values that cannot be broadcast to it.
         """
-        if self._memory is None:
-            # `assign` would fill the beginning of the array with fewer values, and say nothing.
-            np.copyto(self._staged, values)
-            self.array.assign(self._staged)
-        else:
-            np.copyto(self._memory, values)
+        np.copyto(self._values, values)
+        if not self._is_shared:
+            # Given fewer values, `assign` would fill the beginning of the array, and say nothing.
+            self.array.assign(self._values)
 
     def zero(self) -> None:
         """Set all values to zero."""
-        if self._memory is None:
-            self.array.zero_()
+        if self._is_shared:
+            self._values.fill(0)
         else:
-            self._memory.fill(0)
+            self.array.zero_()
 
     def look(self) -> NDArray[Any]:
         """The values until they change; not to be written to."""
-        return self.array.numpy() if self._memory is None else self._memory
+        return self._values if self._is_shared else self.array.numpy()
 
     def read(self) -> NDArray[Any]:
         """A copy of the values."""
