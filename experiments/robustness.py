@@ -20,6 +20,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, summary
+from ms_slam_env.sequences import check_sequence
 from ms_slam_env.sequences.sequence import Frames
 from ms_slam_env.sequences.sequence import Sequence as Recording
 
@@ -30,10 +31,11 @@ WORSE = 2.0
 _SIGMAS = 3.0  # that an error may have before the covariance is taken to be wrong
 _ONE_IN = 1_000_000  # pixels
 _UNIT_M = 0.001  # of depth, in the images of most recordings
+_LARGEST = "640x480"  # the native size of what is rendered
 USME = "usme:"
 """Before the name of one of the eight USME sequences and a seed, as in usme:city-traffic:2000."""
 
-ROOMS = ("living_room", "table", "office", "corridor", "carpet")
+ROOMS = ("living_room", "corridor", "table", "window", "wall", "carpet")
 PERTURBED = (
     *("rolling-shutter", "misregistration", "motion-blur", "auto-exposure", "depth-dropout"),
     *("depth-quantisation", "illumination"),
@@ -155,17 +157,17 @@ class RobustnessSpec:
         from ms_slam_env.sequences import HandheldPath, open_sequence, usme_suite
 
         if self.source.startswith(USME):
-            name, _, seed = self.source.removeprefix(USME).rpartition(":")
+            name, seed = _usme(self.source)
             entry = usme_suite.find(name)
-            size = "640x480" if self.image_size == NATIVE else self.image_size
-            given: Recording = usme_suite.render(entry, scenes.make(entry.scene, int(seed)), size)
+            size = _LARGEST if self.image_size == NATIVE else self.image_size
+            given: Recording = usme_suite.render(entry, scenes.make(entry.scene, seed), size)
         else:
             path = HandheldPath(self.frames)
             size = self.image_size
             if self.layout:  # a recording may have another aspect
                 size = size if size == NATIVE else f"{size}+crop"
             elif size == NATIVE:
-                size = "640x480"
+                size = _LARGEST
             given = open_sequence(
                 self.source, size, path=path, with_truth=True, layout=self.layout or "auto"
             )
@@ -212,10 +214,14 @@ class Robustness(Experiment, Checked):
         check_each("variation", self.variations, VARIATIONS)
         for size in self.image_sizes:
             parse_image_size(size)
+        if not self.image_sizes or not self.backends:
+            raise InputError("image_sizes and backends need one value each at least")
         for text in self.backends:
             slam.check_parameters(*parse_named(text, "backend"))
-        for text in self.recordings:
-            _recording(text)
+        for _, text, layout in self.sources():
+            if not layout:
+                check: Callable[[str], object] = _usme if text.startswith(USME) else check_sequence
+                check(text)
 
     def sources(self) -> list[tuple[str, str, str]]:
         """Name, source and layout of every sequence; the layout is empty for rendered ones."""
@@ -237,12 +243,11 @@ class Robustness(Experiment, Checked):
     @staticmethod
     def run(spec: RobustnessSpec) -> dict[str, Any]:
         """Track the changed sequence from its true first pose."""
-        from ms_slam_env.evaluation.run_sequence import run_sequence
+        from ms_slam_env.evaluation.run_sequence import run_backend
 
         limit_threads(1)
         given = spec.opened()
-        name, params = parse_named(spec.backend, "backend")
-        run = run_sequence(slam.make(name, given.intrinsics, **params), given)
+        run = run_backend(spec.backend, given)
         ate = metrics.ate_statistics(run.estimates, given.poses)
         return {
             "frames": len(run),
@@ -290,6 +295,20 @@ def _recording(text: str) -> tuple[str, str, str]:
     if not colon or Path(place).exists():
         return name, place, "auto"
     return name, folder, layout
+
+
+def _usme(text: str) -> tuple[str, int]:
+    """Name and seed of usme:NAME:SEED.
+
+    Raises:
+        InputError: another form, or no such sequence; lists the valid choices.
+    """
+    from ms_slam_env.sequences.usme_suite import find
+
+    name, _, seed = text.removeprefix(USME).rpartition(":")
+    if not seed.isdecimal():
+        raise InputError(f"sequence {text!r} is not usme:NAME:SEED, as in usme:city-traffic:2000")
+    return find(name).name, int(seed)
 
 
 def position_sigma(covariances: Iterable[Float64 | None]) -> float | None:

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ms_slam_experiments.robustness import VARIATIONS, RobustnessSpec, judged, part_of
+from ms_slam_experiments.robustness import (
+    VARIATIONS,
+    Robustness,
+    RobustnessSpec,
+    judged,
+    part_of,
+)
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences import open_sequence
@@ -65,9 +71,30 @@ def test_success_is_few_losses_and_an_error_near_the_best_median() -> None:
     assert part_of("usme:city-traffic:2000") == part_of("../hololens") == "judging"
 
 
-def test_a_recording_is_named_with_its_folder() -> None:
-    from ms_slam_experiments.robustness import Robustness
+def test_what_is_run_by_default_exists() -> None:
+    made = Robustness(image_sizes=("80x60",), variations=("none",))
+    specs = made.specs()
+    assert {part_of(spec.source) for spec in specs} == {"tuning", "judging"}
+    assert len({spec.sequence for spec in specs}) == len(specs) == 2 * (6 + 10 + 8)
 
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"sequences": ("no-such-scene:1",)}, "unknown scene 'no-such-scene'; valid choices: "),
+        ({"sequences": ("usme:no-such-sequence:1",)}, "unknown USME sequence .*city-traffic"),
+        ({"sequences": ("usme:city-traffic",)}, "is not usme:NAME:SEED"),
+        ({"backends": ("no-such-backend",)}, "unknown SLAM backend .*valid choices: surfel"),
+        ({"variations": ("upside-down",)}, "unknown variation .*valid choices: none"),
+        ({"image_sizes": ()}, "image_sizes and backends need one value"),
+    ],
+)
+def test_what_does_not_exist_is_refused_before_anything_runs(options, complaint) -> None:
+    with pytest.raises(InputError, match=complaint):
+        Robustness(**options)
+
+
+def test_a_recording_is_named_with_its_folder() -> None:
     made = Robustness(recordings=("h=folder:some/where",), image_sizes=("80x60",))
     (first, *_) = made.specs()
     assert isinstance(first, RobustnessSpec)
