@@ -179,7 +179,7 @@ class Compare(Experiment, Checked):
         limit_threads(spec.threads)
         if spec.trajectory:
             return judge_trajectory(spec)
-        return judge_command(spec) if spec.command else run_backend(spec)
+        return judge_command(spec) if spec.command else judge_backend(spec)
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """Tabulate, for each image size, the sequences with medians, then paired differences."""
@@ -289,7 +289,7 @@ def parse_trajectories(text: str, several: bool) -> TrajectoryPattern:
     return TrajectoryPattern(name, pattern)
 
 
-def run_backend(spec: CompareSpec) -> dict[str, Any]:
+def judge_backend(spec: CompareSpec) -> dict[str, Any]:
     """Track the sequence from its true first pose and measure.
 
     Costs exclude the first frames; memory is the backend's own peak, including libraries but not

@@ -67,11 +67,6 @@ class Planner(ABC):
             raise InputError(f"{cls.__name__} needs the truth, which no {type(env).__name__} has")
         return cls.view(env)
 
-    @property
-    def env(self) -> Any:
-        """``robot``, under its former name."""
-        return self.robot
-
     def known(self, info: dict[str, Any]) -> dict[str, Any]:
         """The part of ``info`` from ``reset`` or ``step`` that ``act`` may see."""
         return without_truth(info)

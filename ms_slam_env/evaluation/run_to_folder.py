@@ -251,16 +251,18 @@ def measure(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
     """Metrics of a run, finished or not; those against the truth only where there is one.
 
     ``frames``, ``lost_frames``, ``uncertain_frames``, ``processed_frames``, ``path_m`` of the
-    estimate; what `trajectory_errors` gives; the costs by the names of ``CostMeter.summary``.
+    truth where all of it is known, else of the estimate; what `trajectory_errors` gives; the costs
+    by the names of ``CostMeter.summary``.
     """
     if not len(run) or run.meter is None:
         return {"frames": 0}
+    is_known = bool(np.isfinite(run.true_poses).all())
     return {
         "frames": len(run),
         "lost_frames": run.lost_frames,
         "uncertain_frames": run.uncertain_frames,
         "processed_frames": int(run.processed.sum()),
-        "path_m": metrics.path_length(run.estimates),
+        "path_m": metrics.path_length(run.true_poses if is_known else run.estimates),
         **submap_measures(run),
         **run.meter.summary(),
         **trajectory_errors(run, run.estimates, sequence),

@@ -140,7 +140,7 @@ def test_a_view_says_what_the_environment_estimates(played):
 def test_who_asks_for_the_truth_is_told_who_may_have_it(played):
     class Curious(Planner):
         def act(self, observation, info):
-            return int(self.env.scene.seed)
+            return int(self.robot.scene.seed)
 
     class Told(PrivilegedPlanner, Curious):
         pass

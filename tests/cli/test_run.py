@@ -98,6 +98,8 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     _, truth = read_trajectory(sequence / "groundtruth.txt")
     written = json.loads((out / "metrics.json").read_text())
     assert written["complete"]
+    steps = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)
+    assert written["path_m"] == pytest.approx(steps.sum(), rel=1e-6)
     assert (written["kind"], written["results_version"]) == ("run", RESULTS_VERSION)
     assert [chart["name"] for chart in written["charts"]] == ["path", "error", "alignment", "cost"]
     page = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
