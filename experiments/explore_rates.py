@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ms_slam_experiments.shared.sampler_studies import explore_in_memory
+
 from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
@@ -19,7 +21,7 @@ from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_config import PAPER
 from ms_slam_env.tuning import SlamEvaluator, make_space
 from ms_slam_env.tuning.objectives import FAILURE, as_metrics
-from ms_slam_env.tuning.samplers import SAMPLERS, explore_in_memory
+from ms_slam_env.tuning.samplers import SAMPLERS
 
 OBJECTIVES = ("ate_max_m", "ext_ms")
 ERROR, COST = "ate_max_m", "cpu_ms_median"

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ms_slam_experiments.shared.sampler_studies import Grid, explore_in_memory
 
 from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.config import Checked, bounded
@@ -20,7 +21,7 @@ from ms_slam_env.report.tables import Column, Table, finished, make_table
 from ms_slam_env.tuning import SlamEvaluator, make_space
 from ms_slam_env.tuning.front import hypervolume
 from ms_slam_env.tuning.objectives import FAILURE, objective_values
-from ms_slam_env.tuning.samplers import SAMPLERS, Grid, explore_in_memory
+from ms_slam_env.tuning.samplers import SAMPLERS
 
 OBJECTIVES = ("ate_m", "load_ms")
 PARAMETERS = (

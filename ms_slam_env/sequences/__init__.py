@@ -7,7 +7,7 @@ By name, as every command takes it: a folder, or scene:seed[:word[+word ...]] (`
 Rendered, streamed and reproducible bit for bit::
 
     poses = HandheldPath(frames=600, loop=True).poses(scene, seed=1)  # or handheld_trajectory,
-    # repeated_trajectory, place_trajectory(scene, *read_trajectory(file)[1:]).poses
+    # place_trajectory(scene, *read_trajectory(file)[1:]).poses
     sequence = render_sequence(
         scene, poses, intrinsics, noise="kinect", seed=1,
         perturbations=(RollingShutter(0.03), ExposureJumps(gain=1.5), DepthDropout(0.1)),
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
         WanderingPath,
         handheld_trajectory,
         place_trajectory,
-        repeated_trajectory,
     )
     from ms_slam_env.sequences.perturbations import (
         PERTURBATIONS,
@@ -109,6 +108,5 @@ __all__ = [
     "place_trajectory",
     "read_trajectory",
     "render_sequence",
-    "repeated_trajectory",
     "write_trajectory",
 ]

@@ -531,9 +531,9 @@ class _Formula:
 def explore_samplers(folder: Path) -> Any:
     """Samplers on a formula: with real runs, an objective is a time."""
     from ms_slam_experiments.explore_samplers import run_study, summarise
+    from ms_slam_experiments.shared.sampler_studies import Grid
 
     from ms_slam_env.tuning import make_space
-    from ms_slam_env.tuning.samplers import Grid
 
     space = make_space(["icp_rgb_weight=0:1", "keep_every=1:6"])
     grid = Grid(space, _Formula(), 4, folder / "evaluations.jsonl")  # type: ignore[arg-type]

@@ -11,7 +11,6 @@ from ms_slam_env.sequences import (
     Sequence,
     handheld_trajectory,
     render_sequence,
-    repeated_trajectory,
 )
 
 SPEED_M, ROT_DEG = 0.015, 1.0
@@ -40,16 +39,6 @@ def test_the_seed_decides_the_path(box_scene: BoxScene) -> None:
     first, again, other = (handheld_trajectory(box_scene, 50, seed) for seed in (3, 3, 4))
     assert np.array_equal(first, again)
     assert not np.allclose(first, other)
-
-
-@pytest.mark.parametrize("frames", [40, 41])
-def test_a_repeated_path_ends_where_it_began(box_scene: BoxScene, frames: int) -> None:
-    poses = repeated_trajectory(box_scene, frames, seed=1, passes=3)
-    assert poses.shape == (3 * frames, 4, 4)
-    np.testing.assert_array_equal(poses[:frames], poses[frames : 2 * frames])
-    np.testing.assert_array_equal(poses[frames - 1 if frames % 2 == 0 else frames], poses[0])
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    assert steps.max() <= SPEED_M + np.sqrt(3) * TREMOR_M
 
 
 def test_a_sequence_is_the_same_each_time(box_scene: BoxScene) -> None:

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from ms_slam_env.sequences.paths.wandering import (
         WanderingPath,
         handheld_trajectory,
-        repeated_trajectory,
     )
 else:
     __getattr__ = lazy_names(__name__)
@@ -31,5 +30,4 @@ __all__ = [
     "WanderingPath",
     "handheld_trajectory",
     "place_trajectory",
-    "repeated_trajectory",
 ]

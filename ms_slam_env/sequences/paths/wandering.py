@@ -191,29 +191,6 @@ def free_path(
     raise InputError(f"found no free trajectory in scene {scene.name!r}, seed {scene.seed}")
 
 
-def repeated_trajectory(
-    scene: Scene,
-    frames: int,
-    seed: int,
-    passes: int = 2,
-    speed_m: float = 0.015,
-    rot_deg: float = 1.0,
-) -> Float64:
-    """Poses (passes * frames, 4, 4): the same way there and back, ``passes`` times.
-
-    Every pass has the same ``frames`` poses and ends where it began, so nothing that a later pass
-    sees is new.
-
-    Raises:
-        InputError: fewer than 4 frames, fewer than 1 pass, or as handheld_trajectory.
-    """
-    if frames < 4 or passes < 1:
-        raise InputError(f"need at least 4 frames and 1 pass, got {frames} and {passes}")
-    there = handheld_trajectory(scene, (frames + 1) // 2, seed, speed_m, rot_deg)
-    back = there[::-1][: frames // 2]
-    return np.tile(np.concatenate([there, back]), (passes, 1, 1))
-
-
 @dataclass(frozen=True)
 class WanderingPath(Checked, CameraPath):
     """A hand-held camera that is always as fast as two limits permit: ``handheld_trajectory``.
