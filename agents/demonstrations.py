@@ -89,9 +89,9 @@ class Demonstration:
             lengths = {len(getattr(made, name)) for name in _ARRAYS}
             kinds = {name: getattr(made, name).ndim for name in _ARRAYS}
         except Exception as error:  # a damaged archive can raise anything
-            raise InputError(f"{path} is no demonstration: {error}") from None
+            raise InputError(f"{path} is not a demonstration: {error}") from None
         if len(lengths) != 1 or kinds != _ARRAYS:
-            raise InputError(f"{path} is no demonstration: arrays that do not fit each other")
+            raise InputError(f"{path} is not a demonstration: arrays that do not fit each other")
         return made
 
     def returns(self, gamma: float) -> NDArray[np.float64]:

@@ -102,7 +102,7 @@ def opened(venv: VecEnv) -> Iterator[VecEnv]:
     try:
         yield venv
     except (EOFError, ConnectionError):
-        raise RuntimeError("the process of an environment has ended; above it says why") from None
+        raise RuntimeError("the process of an environment has died; see the error above") from None
     finally:
         with suppress(EOFError, ConnectionError):
             venv.close()

@@ -110,7 +110,7 @@ class Metadata:
             raise unknown("algorithm", self.algorithm, ALGORITHMS)
         for name in ("env_id", "observation"):
             if not _NAME.fullmatch(getattr(self, name)):
-                raise InputError(f"{name} {getattr(self, name)!r} is no name")
+                raise InputError(f"{name} {getattr(self, name)!r} is not a valid name")
         for name, value in self.env_options.items():
             if name not in _ENV_OPTIONS:
                 raise unknown("option of env_options", name, _ENV_OPTIONS)
@@ -123,10 +123,10 @@ class Metadata:
         ):  # fmt: skip
             many = 0 < len(sizes) <= _MOST_LAYERS
             if not many or not all(0 < size <= _LARGEST_LAYER for size in sizes):
-                raise InputError(f"{name} = {str(sizes)[:80]} are no sizes of layers")
+                raise InputError(f"{name} = {str(sizes)[:80]} are not valid layer sizes")
         for name in ("memory", "candidates", "quantiles"):
             if not 0 <= getattr(self, name) <= _LARGEST_LAYER:
-                raise InputError(f"{name} = {getattr(self, name)} is no width")
+                raise InputError(f"{name} = {getattr(self, name)} is not a valid width")
         if self.candidates and (len(self.actions) > 1 or self.num_state < 0):
             raise InputError(
                 f"{self.inputs} numbers do not hold {self.candidates} for each of {self.actions}"
@@ -138,7 +138,9 @@ class Metadata:
             or self.num_state < 0
             or image_width(self.image) <= 0
         ):
-            raise InputError(f"image = {str(self.image)[:80]} is none in {self.inputs} numbers")
+            raise InputError(
+                f"image = {str(self.image)[:80]} does not fit in {self.inputs} numbers"
+            )
         if self.quantiles and (self.memory or len(self.actions) > 1):
             raise InputError("quantiles go with one number an action, and with no memory")
         for name, most in _MOST.items():

@@ -306,7 +306,7 @@ def restore_learner(learner: Any, file: PolicyFile) -> None:
     normalization = module.fresh_normalization()
     expected = {n: tuple(p.shape) for n, p in module.network.named_parameters()}
     if {n: v.shape for n, v in file.part("policy").items()} != expected:
-        raise InputError("the policy to begin with is of another network")
+        raise InputError("the initial policy has a different network")
     load_parameters(module.network, file)
     restore_moments(normalization, file)
     module.normalization = normalization

@@ -123,7 +123,7 @@ class PpoArgs(PpoTraining):
         """Refuse values out of range, chunks that leave steps over, a pull to nothing."""
         super().__post_init__()
         if self.memory and self.n_steps % min(self.chunk, self.n_steps):
-            raise InputError(f"n_steps = {self.n_steps} is no multiple of chunk = {self.chunk}")
+            raise InputError(f"n_steps = {self.n_steps} is not a multiple of chunk = {self.chunk}")
         if self.pull and self.init is None:
             raise InputError("--pull needs --init (the policy to stay close to)")
 

@@ -74,9 +74,7 @@ class TrainingRun(ABC):
         self, args: Training, observations: spaces.Space, actions: spaces.Space, file: Any
     ) -> None:
         if not isinstance(actions, spaces.Discrete):
-            raise InputError(
-                f"{args.env_id} has actions of several numbers: ms-slam train sb3 takes them"
-            )
+            raise InputError(f"{args.env_id} has actions of several numbers: use ms-slam train sb3")
         assert observations.shape
         self.options = args
         self.inputs, self.actions = observations.shape[0], int(actions.n)

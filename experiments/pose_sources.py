@@ -51,7 +51,7 @@ class PoseSourceExperiment(SteppedExperiment):
         """Every planner with every source."""
         options = parse_options(self.options)
         if "pose" in options:
-            raise InputError("option 'pose' is not free: the benchmark sets it")
+            raise InputError("option 'pose' cannot be set: the benchmark sets it")
         return [
             {"planner": planner, "options": {**options, "pose": source}}
             for planner in self.planners

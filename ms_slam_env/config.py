@@ -369,7 +369,7 @@ def free_options(texts: Sequence[str], taken: Sequence[str]) -> dict[str, Any]:
     found = nested_options(texts)
     for name in found:
         if name in (*taken, "max_episode_steps"):
-            raise InputError(f"option {name!r} is not free: the command sets it")
+            raise InputError(f"option {name!r} cannot be set: the command sets it")
     return found
 
 

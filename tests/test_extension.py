@@ -195,7 +195,7 @@ def test_metrics_come_from_a_function_a_file_and_an_entry_point(module, tmp_path
     assert registry.metric("brightness").heading == "brightness"
     extra.write_text("ate_m: {heading: other, definition: Another.}\n")
     registry.registry.cache_clear()
-    with pytest.raises(InputError, match=r"'ate_m' of .*more.yaml is defined otherwise"):
+    with pytest.raises(InputError, match=r"'ate_m' of .*more.yaml is already defined differently"):
         registry.metric("wobble_m")
     monkeypatch.delenv("MS_SLAM_METRICS")
     registry.registry.cache_clear()

@@ -105,7 +105,7 @@ class ExtensionPoint:
         """``found``, if it is of this kind."""
         if self.base is None:
             if not callable(found):
-                raise InputError(f"{self.kind} {name!r} is nothing that can be called")
+                raise InputError(f"{self.kind} {name!r} is not callable")
         elif not (inspect.isclass(found) and issubclass(found, self.base)):
             module = self.base.__module__.rpartition(".")[0]
             raise InputError(

@@ -285,7 +285,7 @@ def parse_trajectories(text: str, several: bool) -> TrajectoryPattern:
     if not (name and sign and pattern):
         raise InputError(f"trajectories {text!r} are not NAME=FILE, as in orb=orb/{_BLANK}.txt")
     if several and _BLANK not in pattern:
-        raise InputError(f"trajectories {text!r}: of several sequences the file needs {_BLANK}")
+        raise InputError(f"trajectories {text!r}: with several sequences the file needs {_BLANK}")
     return TrajectoryPattern(name, pattern)
 
 

@@ -84,8 +84,8 @@ class EpisodeSpec(Checked):
         name = self.planner.partition(",")[0]
         if self.env_id == ADAPTIVE_ID and ":" not in name:
             raise InputError(
-                f"planner {name!r} chooses motions only, {ADAPTIVE_ID} asks for a SLAM "
-                "configuration too; valid choices: module:Class"
+                f"planner {name!r} chooses motions only, {ADAPTIVE_ID} also needs a "
+                "SLAM configuration; valid choices: module:Class"
             )
 
 
@@ -244,7 +244,7 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
     result = nested_options(texts)
     for name in result:
         if name in OWN_OPTIONS:
-            raise InputError(f"option {name!r} is not free: the benchmark sets it")
+            raise InputError(f"option {name!r} cannot be set: the benchmark sets it")
     embodiment = result.get("embodiment", next(iter(EMBODIMENTS)))
     if embodiment not in EMBODIMENTS:
         raise unknown("embodiment", embodiment, EMBODIMENTS)

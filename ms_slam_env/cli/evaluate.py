@@ -107,7 +107,7 @@ def main(arguments: Sequence[str]) -> int:
     if (args.truth is None) != (not args.runs):
         raise InputError("Missing file: runs are given as --runs FILE ... --truth GROUNDTRUTH")
     if args.runs and (args.estimate is not None or args.map is not None):
-        raise InputError("--runs stand alone: without ESTIMATE, GROUNDTRUTH and --map")
+        raise InputError("--runs cannot be combined with ESTIMATE, GROUNDTRUTH or --map")
     if args.estimate is None and args.map is None and not args.runs:
         raise InputError(
             "Missing files: ESTIMATE GROUNDTRUTH, --runs FILE ... --truth GROUNDTRUTH, or "

@@ -77,7 +77,7 @@ def main(arguments: Sequence[str]) -> int:
     if args.route and (args.planner is not None or args.trajectory is not None):
         raise InputError("--route excludes --planner and --trajectory")
     if args.scale is not None and args.trajectory is None:
-        raise InputError("--scale is of the motion of a --trajectory")
+        raise InputError("--scale needs --trajectory")
     if args.planner is None and args.episode != EpisodeOptions():
         raise InputError("the options of an episode need --planner")
     from ms_slam_env import __version__, scenes

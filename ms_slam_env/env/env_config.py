@@ -169,7 +169,7 @@ class EnvConfig(Checked):
         check_range(self, "num_scene_seeds", 1, most if self.split in SEED_SPLITS else 100_000)
         if self.frame_management.uses_clock:
             raise InputError(
-                "frame_management.measured cannot be had in an environment, whose infos must be "
+                "frame_management.measured is not allowed in an environment, whose infos must be "
                 "reproducible; give cost_per_frame instead"
             )
         if self.scene_seed is not None and (

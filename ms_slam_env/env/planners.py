@@ -225,8 +225,8 @@ def make_planner(text: str, env: Any, seed: int = 0, **more: Any) -> Planner:
         cls.motions_only or recovery
     ):
         raise InputError(
-            f"planner {text!r} chooses motions only; this environment asks for a SLAM "
-            "configuration too, as random, policy or one of your own chooses it"
+            f"planner {text!r} chooses motions only; this environment also needs a "
+            "SLAM configuration, which random, policy or a planner of your own can choose"
         )
     robot = cls.seen_of(env)
     planner: Planner = cls(robot, seed=seed, **options)

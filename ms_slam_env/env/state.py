@@ -76,7 +76,9 @@ def check_parts(state: Any) -> None:
         InputError: naming the missing parts.
     """
     if not isinstance(state, Mapping):
-        raise InputError(f"a {type(state).__name__} is no state; give what save_state() returned")
+        raise InputError(
+            f"a {type(state).__name__} is not a saved state; pass what save_state() returned"
+        )
     check_keys(state, PARTS, "state")
 
 

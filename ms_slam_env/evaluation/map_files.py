@@ -155,7 +155,7 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
     file = MeshFile.named(path)
     if file is None:
         raise InputError(
-            f"map file {str(path)!r} is neither a folder nor of a format that is read: "
+            f"map file {str(path)!r} is neither a folder nor in a supported format: "
             + ", ".join(MESH_SUFFIXES)
         )
     parts = file.read()

@@ -115,9 +115,9 @@ def write_mesh(path: Path, backend: SlamBackend) -> int:
     open3d = load_open3d("a mesh")
     points, known = backend.surface_points(), backend.map_attributes()
     if "normal" not in known:
-        raise InputError("a mesh needs normals, which this backend's surface has not")
+        raise InputError("a mesh needs normals, which this backend's surface lacks")
     if len(points) < 100:
-        raise InputError(f"a surface of {len(points)} points is too little for a mesh")
+        raise InputError(f"a surface of {len(points)} points is too small for a mesh")
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     cloud.normals = open3d.utility.Vector3dVector(np.asarray(known["normal"], dtype=np.float64))
     cloud.colors = open3d.utility.Vector3dVector(known["color"] / 255.0)

@@ -245,7 +245,7 @@ def tracked_at(path: Path, times: Float64) -> NDArray[np.bool_]:
     found = [known.get(round(1e6 * t)) for t in times]
     if None in found:
         t = times[found.index(None)]
-        raise InputError(f"{path} is of other frames: it has none at {t:.6f} s")
+        raise InputError(f"{path} belongs to other frames: it has none at {t:.6f} s")
     if sum(map(bool, found)) < 2:
         raise InputError(
             f"{path} leaves {sum(map(bool, found))} tracked poses; at least 2 are needed"

@@ -116,7 +116,7 @@ def inter_robot_errors(
         for k, (estimate, truth) in enumerate(zip(estimates, truths, strict=True))
     ]
     if len(pairs) < 2:
-        raise InputError("one robot has no pose in the frame of another: at least 2 are needed")
+        raise InputError("relative poses of robots need at least 2 robots, got 1")
     clocks: list[Float64]
     if times is None:
         clocks = [np.arange(len(own), dtype=np.float64) for own, _ in pairs]
@@ -135,7 +135,7 @@ def inter_robot_errors(
         errors.append(motion_errors(own, true, at, at + len(first), kind))
     found = np.concatenate(errors)
     if len(found) == 0:
-        raise InputError("no two robots have a moment in common")
+        raise InputError("no two robots overlap in time")
     return found
 
 

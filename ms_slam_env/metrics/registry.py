@@ -166,7 +166,7 @@ def registry() -> Mapping[str, Metric]:
     for source in sources:
         for key, entry in _more(source).items():
             if key in metrics and metrics[key] != _metric(key, entry):
-                raise InputError(f"metric {key!r} of {source} is defined otherwise already")
+                raise InputError(f"metric {key!r} of {source} is already defined differently")
             metrics[key] = _metric(key, entry)
     return metrics
 

@@ -240,7 +240,7 @@ def check_first(align: str, first: int | None) -> None:
         return
     check_count(first, "first")
     if align not in FITTED:
-        raise InputError(f"only {', '.join(FITTED)} align by the first poses, not {align}")
+        raise InputError(f"only {', '.join(FITTED)} can align by the first poses, not {align}")
 
 
 def _covariance(positions: Float64, true_positions: Float64) -> Float64:

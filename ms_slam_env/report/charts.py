@@ -54,7 +54,7 @@ class Series:
         if any(len(part) not in (len(self.x), 0) for part in others) or (
             (len(self.y), len(self.high)) != (len(self.x), len(self.low))
         ):
-            raise InputError(f"series {self.name!r}: not as many values in each of its columns")
+            raise InputError(f"series {self.name!r}: its columns differ in length")
 
 
 @dataclass(frozen=True)

@@ -157,6 +157,6 @@ def _cut(table: Table, options: dict[str, str]) -> Table:
     rows = [row for row in table.rows if not column or str(row.get(column)) in wanted.split("|")]
     count = options.get("rows", str(len(rows)))
     if not count.isdecimal():
-        raise InputError(f"rows = {count!r} is no number")
+        raise InputError(f"rows = {count!r} is not a number")
     chosen = tuple(columns[name] for name in names)
     return dataclasses.replace(table, title="", columns=chosen, rows=tuple(rows[: int(count)]))

@@ -95,7 +95,7 @@ def read_policy_text(path: Path) -> Policy:
         known = json.loads(text)
         return Policy(path, {**known, "timesteps": int(known["timesteps"])})
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{path} is no policy file: {error!r}") from None
+        raise InputError(f"{path} is not a policy file: {error!r}") from None
 
 
 def model_cards(paths: Sequence[Path], results: Path, page: Path) -> str:

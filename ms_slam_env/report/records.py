@@ -152,7 +152,7 @@ def build(cls: type[T], values: Mapping[str, Any]) -> T:
         value = getattr(made, field.name)
         of_many = str(field.type).startswith("Sequence")
         if of_many and not isinstance(value, (list, tuple)):
-            raise TypeError(f"{field.name} is no list")
+            raise TypeError(f"{field.name} is not a list")
         kinds = _PLAIN.get(str(field.type))
         if kinds is not None:
             for part in value if of_many else (value,):

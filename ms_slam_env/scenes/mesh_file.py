@@ -58,7 +58,7 @@ def load_soup(name: str | Path) -> Soup:
     """
     file = MeshFile.named(name)
     if file is None:
-        raise InputError(f"{str(name)!r} is no mesh file ({', '.join(MESH_SUFFIXES)})")
+        raise InputError(f"{str(name)!r} is not a mesh file ({', '.join(MESH_SUFFIXES)})")
     corners, uvs, texture, label = [], [], [], []
     images: list[NDArray[np.uint8]] = []
     place: dict[object, int] = {}  # of an image, for parts share them

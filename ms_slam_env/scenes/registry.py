@@ -77,7 +77,7 @@ def seeds_of(text: str) -> Sequence[int]:
         first, _, last = part.partition("-")
         more = range(int(first), int(last or first) + 1)
         if not more or len(found) + len(more) > _MOST_OWN_SEEDS:
-            raise InputError(f"seeds {text[:80]!r}: {part} is no range of 1 to 100,000 seeds")
+            raise InputError(f"seeds {text[:80]!r}: {part} is not a range of 1 to 100,000 seeds")
         found += more
     if len(set(found)) < len(found):
         raise InputError(f"seeds {text[:80]!r} names one twice")

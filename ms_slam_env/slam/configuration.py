@@ -147,7 +147,7 @@ def configuration_of_map(path: str | Path) -> SlamConfiguration:
 def _part(about: Mapping[str, Any], key: str, path: str | Path) -> Mapping[str, Any]:
     part = about.get(key)
     if not isinstance(part, Mapping):
-        raise InputError(f"{path} does not say its {key}")
+        raise InputError(f"{path} has no {key}")
     return part
 
 
@@ -170,7 +170,7 @@ def read_configuration(path: str | Path) -> SlamConfiguration:
         raise InputError(f"{path}: not YAML: {error}") from None
     if not isinstance(content, Mapping):
         fields = ", ".join(field.name for field in dataclasses.fields(SlamConfiguration))
-        raise InputError(f"{path}: holds no mapping of {fields}")
+        raise InputError(f"{path}: must hold a mapping of {fields}")
     try:
         return from_dict(SlamConfiguration, content)
     except InputError as error:
@@ -189,7 +189,7 @@ def read_levels(path: str | Path, part: str) -> Mapping[str, Any]:
         raise InputError(f"{path}: not YAML: {error}") from None
     found = content.get(part) if isinstance(content, Mapping) else None
     if not isinstance(found, Mapping):
-        raise InputError(f"{path}: says nothing of {part}")
+        raise InputError(f"{path}: has no section {part!r}")
     return found
 
 

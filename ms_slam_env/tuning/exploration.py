@@ -70,7 +70,9 @@ class Exploration(Checked):
                 f"energy_j is not available: {reason}; energy_model_j is what a stated model says"
             )
         if "energy_model_j" in asked and not reason:
-            raise InputError("energy_model_j stands in where nothing is counted; take energy_j")
+            raise InputError(
+                "energy_model_j is only for machines without energy counters; use energy_j"
+            )
         both = set(self.held_out) & set(self.evaluator.sequences)
         if both:
             raise InputError(f"sequence {sorted(both)[0]} is explored and held out")

@@ -274,7 +274,7 @@ _EVERYWHERE = {
     "gpu_mhz": "a GPU's clock belongs to all who share it, and is not touched",
     "precision": "the kernels of SLAM work on 32-bit numbers alone",
 }
-_ON_A_GPU = {"compiler.vectorise": "it is of the CPU's compiler, and the device is a GPU"}
+_ON_A_GPU = {"compiler.vectorise": "it is an option of the CPU's compiler, and the device is a GPU"}
 
 
 def why_absent(name: str, base: SlamConfiguration) -> str:

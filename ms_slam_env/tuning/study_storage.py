@@ -195,7 +195,9 @@ class StudyStorage:
             check_own(Path(f"{path}{ending}"))
         journal = Path(f"{path}-journal")
         if is_named(journal):  # it may name a file that SQLite deletes
-            raise InputError(f"{journal} is of no exploration: those write {path.name}-wal")
+            raise InputError(
+                f"{journal} does not belong to an exploration, which writes {path.name}-wal"
+            )
         if is_named(path):
             check_file(path, "study", _MAX_BYTES)
 

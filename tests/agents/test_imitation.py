@@ -296,7 +296,7 @@ def test_ppo_goes_on_from_what_was_imitated(tmp_path):
     ("change", "said"),
     [
         (lambda out: (out / "latest.safetensors").write_bytes(b"no"), "is not a policy"),
-        (lambda out: next((out / "episodes").iterdir()).write_bytes(b"PK"), "no demonstration"),
+        (lambda out: next((out / "episodes").iterdir()).write_bytes(b"PK"), "not a demonstration"),
     ],
 )
 def test_damaged_runs_are_one_line(copied, capsys, change, said):
@@ -353,5 +353,5 @@ def test_what_is_no_demonstration_is_refused(tmp_path):
     path = tmp_path / "x.npz"
     for arrays in ({"labels": np.zeros(3)}, {"observations": np.array([{}], dtype=object)}):
         np.savez(path, **arrays)
-        with pytest.raises(InputError, match="no demonstration"):
+        with pytest.raises(InputError, match="not a demonstration"):
             Demonstration.read(path)

@@ -126,8 +126,8 @@ def test_options_may_name_the_embodiment() -> None:
     for text, message in (
         ("embodiment=boat", "unknown embodiment 'boat'; valid choices: arm, arm-kinematic, free"),
         ("boat=1", "option of the environment 'boat'; valid choices: embodiment, num_scene_seeds"),
-        ("render_mode=human", "option 'render_mode' is not free: the benchmark sets it"),
-        ("max_episode_steps=3", "option 'max_episode_steps' is not free: the benchmark sets it"),
+        ("render_mode=human", "option 'render_mode' cannot be set: the benchmark sets it"),
+        ("max_episode_steps=3", "option 'max_episode_steps' cannot be set: the benchmark sets it"),
     ):
         with pytest.raises(InputError, match=message):
             parse_options([text])

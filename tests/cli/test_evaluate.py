@@ -316,7 +316,10 @@ def test_frames_beside_the_estimate_say_what_was_tracked(
     scaled = evaluate_files(*map(Path, pair), TrajectoryOptions("sim3"))
     assert (scaled["tracked_share"], scaled["ate_tracked_m"]) == (0.75, None)
     # One that is of other frames, or no table of ours, is left aside with a word.
-    for lines, word in ((rows[:-1], "is of other frames"), (["a,b"], "line 1: expected columns")):
+    for lines, word in (
+        (rows[:-1], "belongs to other frames"),
+        (["a,b"], "line 1: expected columns"),
+    ):
         head = ["timestamp,tracking_ok"] if len(lines) > 1 else []
         frames.write_text("\n".join([*head, *lines]))
         assert main(["evaluate", *pair]) == 0

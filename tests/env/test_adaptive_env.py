@@ -136,6 +136,8 @@ def test_bad_options(options, message):
 )
 def test_planners_of_motions_alone_are_refused(planner):
     world = gym.make(ID, **OPTIONS).unwrapped
-    with pytest.raises(InputError, match=r"chooses motions only; .*as random, policy or one"):
+    with pytest.raises(
+        InputError, match=r"chooses motions only; .*which random, policy or a planner"
+    ):
         make_planner(planner, world)
     assert make_planner("random", world)

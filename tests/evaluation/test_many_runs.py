@@ -141,7 +141,7 @@ def test_latex_escapes_and_csv_keeps_full_numbers() -> None:
         (lambda o: [*o, "--tables", "word"], "--tables and --rerun write files"),
         (lambda o: [*o, "--tables", "word", "--out", "x"], "valid choices: latex, csv"),
         (lambda o: [*o, "--deltas", "500"], "good1.txt: delta = 500"),
-        (lambda o: ["evaluate", o[-1], o[-1], *o[1:]], "--runs stand alone"),
+        (lambda o: ["evaluate", o[-1], o[-1], *o[1:]], "--runs cannot be combined"),
         (lambda o: [o[0], o[1], o[2], *o[2:]], "a run is given twice"),
         (lambda o: [*o[:2], "=x", *o[2:]], "is not FILE or NAME=FILE"),
         (lambda o: [*o[:2], "nobody.txt", *o[2:]], "nobody.txt"),

@@ -31,7 +31,7 @@ REFUSED = {
         ({"image_sizes": ("3x3",)}, "valid choices"),
         ({"frames": 1}, "outside"),
         ({"trajectories": ("orb",)}, "'orb' are not NAME=FILE"),
-        ({"trajectories": ("orb=one.txt",)}, "of several sequences the file needs {sequence}"),
+        ({"trajectories": ("orb=one.txt",)}, "with several sequences the file needs {sequence}"),
         ({"trajectories": ("surfel={sequence}.txt",)}, "must differ"),
         ({"reference": "orb"}, "unknown reference 'orb'; valid choices: surfel"),
         ({"threads": 0}, "outside"),
@@ -104,7 +104,7 @@ REFUSED = {
         ({"sources": ("odometry",)}, "valid choices: slam, slam-kinematics, kinematics"),
         ({"sources": ()}, "at least one"),
         ({"sources": ("slam", "slam")}, "must be different"),
-        ({"options": ("pose=slam",)}, "option 'pose' is not free"),
+        ({"options": ("pose=slam",)}, "option 'pose' cannot be set"),
         ({"seeds": "exam"}, "unknown split of seeds 'exam'"),
     ],
     "relocalization": [

@@ -237,7 +237,7 @@ def test_wrong_options() -> None:
         ate_rmse(estimate[1:], truth)
     with pytest.raises(InputError, match="moves"):
         ate_rmse(truth[:1].repeat(4, axis=0), truth[:4], align="sim3")
-    with pytest.raises(InputError, match="se3, sim3, yaw align by the first poses, not origin"):
+    with pytest.raises(InputError, match="se3, sim3, yaw can align by the first poses, not origin"):
         ate_rmse(estimate, truth, "origin", first=3)
     with pytest.raises(InputError, match="first must be an integer >= 1"):
         ate_rmse(estimate, truth, first=0)

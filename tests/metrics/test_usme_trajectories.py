@@ -186,7 +186,7 @@ def test_robots_are_compared_at_equal_times() -> None:
     errors = inter_robot_errors([a, late], [a, b], times=times)
     np.testing.assert_allclose(errors, [1.0] * 20 + [0.0] * 10, atol=1e-9)
     assert len(inter_robot_errors([a, b[:7]], [a, b[:7]])) == 7
-    with pytest.raises(InputError, match="no two robots have a moment in common"):
+    with pytest.raises(InputError, match="no two robots overlap in time"):
         inter_robot_errors([a, b], [a, b], times=[TIMES[:40], TIMES[:40] + 100])
     with pytest.raises(InputError, match="at least 2"):
         inter_robot_errors([a], [a])

@@ -66,7 +66,7 @@ def test_age_and_command_stand_with_the_table(clone: Path) -> None:
         (PAGE.format("x table=7", ""), "line 3: unknown table '7'; valid choices: 0, 1, Empty one"),
         (PAGE.format("x columns=ate", ""), "line 3: unknown column 'ate'"),
         (PAGE.format("x colums=ate_m", ""), "line 3: unknown option 'colums'"),
-        (PAGE.format("x rows=many", ""), "line 3: rows = 'many' is no number"),
+        (PAGE.format("x rows=many", ""), "line 3: rows = 'many' is not a number"),
         (PAGE.format("x 'y", ""), "line 3: .*no closing quotation"),
         (PAGE.format("y", ""), "line 3: cannot read result"),
         ("<!-- results: x -->\n", "line 1: no <!-- end -->"),

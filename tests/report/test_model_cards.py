@@ -262,5 +262,5 @@ def test_what_is_no_policy_is_refused(
     (clone / "agents/policies/other.safetensors").write_bytes(content)
     assert main(["docs", "--root", str(clone)]) == 2
     error = capsys.readouterr().err
-    assert "other.safetensors is no policy file" in error
+    assert "other.safetensors is not a policy file" in error
     assert error.count("\n") == 1

@@ -179,7 +179,7 @@ def test_what_is_no_mesh_inside_a_mesh_file_is_refused(tmp_path, read):
     for vertex in (2**30, 8, -1):
         there = vertex.to_bytes(4, "little", signed=True)
         (tmp_path / "a.ply").write_bytes(data[:first_face] + there + data[first_face + 4 :])
-        said = r"a face has a vertex beyond the 8 that|is out of bounds"
+        said = r"a face refers to a vertex beyond the 8 of|is out of bounds"
         with pytest.raises(InputError, match=said):
             read(tmp_path / "a.ply")
     (tmp_path / "b.obj").write_text("v -1.0000")

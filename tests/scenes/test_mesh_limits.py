@@ -191,7 +191,7 @@ GLTF_CHANGES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "buffer": (lambda t: t["buffers"][0].update(byteLength=2**40), "168 bytes of 1099511627776"),
     "offset": (lambda t: t["accessors"][1].update(byteOffset=1), "do not fit"),
     "negative": (lambda t: t["accessors"][1].update(count=-8), "-8 is negative"),
-    "fraction": (lambda t: t["accessors"][1].update(count=7.5), "7.5 is no whole number"),
+    "fraction": (lambda t: t["accessors"][1].update(count=7.5), "7.5 is not a whole number"),
     "twice": (lambda t: t["scenes"][0].update(nodes=[0, 0]), "node 0 has two places"),
     "circle": (lambda t: t["nodes"][0].update(children=[0]), "node 0 has two places"),
     "places": (
@@ -262,7 +262,7 @@ PLY_HEAD += "property float z\nelement face {}\nproperty list {} int vertex_indi
         (2**40, 1, "uchar", "element vertex ends beyond the file|within an element"),
         (3, 2**40, "uchar", "triangles, more than|ends beyond|within an element"),
         (3, 1, "uint", "within an element|more than"),
-        (3, 1, "char", "within an element|a face has a vertex beyond|more than"),
+        (3, 1, "char", "within an element|a face refers to a vertex beyond|more than"),
     ],
 )
 def test_sizes_that_a_ply_states(

@@ -190,8 +190,8 @@ def test_seeds_may_be_ones_own():
         ("-3", "split of seeds '-3'"),
         ("7000-", "split of seeds '7000-'"),
         ("1 2", "split of seeds '1 2'"),
-        ("7003-7000", "7003-7000 is no range"),
-        ("0-9999999999", "0-9999999999 is no range of 1 to 100,000 seeds"),
+        ("7003-7000", "7003-7000 is not a range"),
+        ("0-9999999999", "0-9999999999 is not a range of 1 to 100,000 seeds"),
         ("1,2,1", "names one twice"),
     ],
 )

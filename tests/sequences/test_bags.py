@@ -357,5 +357,5 @@ def test_files_that_are_no_bags(tmp_path, bag):
     with pytest.raises(InputError, match="cannot read"):
         open_recording(path)
     (tmp_path / "depth").mkdir()
-    with pytest.raises(InputError, match="is no bag: it has no topics"):
+    with pytest.raises(InputError, match="is not a bag: it has no topics"):
         open_recording(tmp_path, intrinsics=Intrinsics(9, 9, 4, 4, 9, 9), topics=Topics("/a"))

@@ -80,8 +80,8 @@ def test_an_environment_takes_a_file(tmp_path):
     ("content", "message"),
     [
         ("slam: [", "not YAML: "),
-        ("", "holds no mapping of slam, slam_config, image_size"),
-        ("- surfel", "holds no mapping"),
+        ("", "must hold a mapping of slam, slam_config, image_size"),
+        ("- surfel", "must hold a mapping"),
         (
             "slm: surfel",
             "unknown option of SlamConfiguration 'slm'; valid choices: slam, slam_conf",

@@ -228,12 +228,14 @@ def test_nothing_in_a_file_is_executed(saved, tmp_path):
 
 def test_the_state_of_another_backend_names_what_it_lacks():
     states = {name: _new(name).get_state() for name in ("surfel", "odometry")}
-    with pytest.raises(InputError, match="no state of OdometrySlam: it lacks pose, motion"):
+    with pytest.raises(
+        InputError, match="not a saved state of OdometrySlam: it lacks pose, motion"
+    ):
         _new("odometry").set_state(states["surfel"])
-    with pytest.raises(InputError, match="no state of SurfelSlam: it lacks submaps"):
+    with pytest.raises(InputError, match="not a saved state of SurfelSlam: it lacks submaps"):
         _new("surfel").set_state(states["odometry"])
     managed = make_config(name="regular", every=2).manage(_new("surfel"))
-    with pytest.raises(InputError, match="no state of SelectiveSlam: it lacks"):
+    with pytest.raises(InputError, match="not a saved state of SelectiveSlam: it lacks"):
         managed.set_state(states["surfel"])
 
 

@@ -123,8 +123,8 @@ def test_frame_management_takes_its_threshold_from_a_study(levels_file):
     [
         (None, "cannot read levels"),
         ("a: [", "not YAML"),
-        ("adaptation: 3", "says nothing of adaptation"),
-        ("frame_management: {threshold: 1}", "says nothing of adaptation"),
+        ("adaptation: 3", "has no section 'adaptation'"),
+        ("frame_management: {threshold: 1}", "has no section 'adaptation'"),
         ("adaptation: {configurations: [{}, {}], thresholds: [2, 1]}", "thresholds = "),
         ("adaptation: {configurations: 3}", "configurations = 3"),
     ],

@@ -292,7 +292,7 @@ def test_energy_is_refused_where_there_is_none(sequences, monkeypatch):
     assert row["energy_model_j"] > 0
     counted = {"cpu": NoEnergy("")}
     monkeypatch.setattr(exploration_module, "energy_counters", lambda: counted)
-    with pytest.raises(InputError, match="take energy_j"):
+    with pytest.raises(InputError, match="use energy_j"):
         Exploration(SlamEvaluator(sequences), modelled)
     with pytest.raises(InputError, match="ate_worst_ratio is not measured"):
         Exploration(SlamEvaluator(sequences), ExplorationSettings(("ate_worst_ratio", "ext_ms")))

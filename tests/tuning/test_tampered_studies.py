@@ -169,7 +169,7 @@ def test_a_database_of_another_is_left_as_it_is(tmp_path):
 
 def test_a_journal_which_may_name_a_file_to_delete_is_refused(study):
     (study / "study.db-journal").write_bytes(b"x" * 1024)
-    with pytest.raises(InputError, match=r"study\.db-journal is of no exploration"):
+    with pytest.raises(InputError, match=r"study\.db-journal does not belong to an exploration"):
         open_study(study)
 
 

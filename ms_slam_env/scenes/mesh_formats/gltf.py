@@ -87,7 +87,7 @@ def _check_extensions(tree: dict[str, Any]) -> None:
 
 def _whole(value: Any, what: str) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or value != int(value):
-        raise InputError(f"{what} {value!r} is no whole number")
+        raise InputError(f"{what} {value!r} is not a whole number")
     if value < 0:
         raise InputError(f"{what} {value!r} is negative")
     return int(value)

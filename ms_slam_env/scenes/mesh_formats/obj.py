@@ -152,7 +152,7 @@ def _part(
     vertex, coordinate = _indices(group.corners)
     fans = Polygons.of_lengths(np.array(group.lengths, np.int64))
     if vertex.min() < 1 or coordinate.min() < 0 or coordinate.max() > len(uv):
-        raise InputError("a face has a vertex beyond those that there are")
+        raise InputError("a face refers to a vertex beyond the last")
     faces = vertex[fans.corners] - 1
     part = Part(group.name, places, faces, tint=material.colour)  # refuses other vertices
     if material.image is not None:

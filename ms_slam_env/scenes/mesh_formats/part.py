@@ -50,7 +50,9 @@ class Part:
         """Refuse too many faces, and those of vertices that are not there."""
         check_size(len(self.faces))
         if self.faces.size and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
-            raise InputError(f"a face has a vertex beyond the {len(self.vertices)} that there are")
+            raise InputError(
+                f"a face refers to a vertex beyond the {len(self.vertices)} of the mesh"
+            )
 
 
 @dataclass(frozen=True)

@@ -420,7 +420,7 @@ def open_recording(
         intrinsics = Calibration(intrinsics, False, None)
     name = _recognise(folder) if layout == "auto" else layout
     if topics not in (None, Topics()) and name != "bag":
-        raise InputError(f"{path} is no bag: it has no topics")
+        raise InputError(f"{path} is not a bag: it has no topics")
     if name == "bag":
         found = open_bag(folder, intrinsics, topics, register is not None)
     else:

@@ -81,7 +81,7 @@ def as_configurations(given: Iterable[Any]) -> tuple[SlamConfiguration, ...]:
         raise InputError(f"configurations = {given!r} must be a list of files or mappings")
     configurations = tuple(_configuration(one, index) for index, one in enumerate(given))
     if len(configurations) > MOST:
-        raise InputError(f"configurations has {len(configurations)} entries, at most {MOST} do")
+        raise InputError(f"configurations has {len(configurations)} entries, more than {MOST}")
     return configurations
 
 

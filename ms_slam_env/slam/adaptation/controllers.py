@@ -42,7 +42,7 @@ def rising(values: Any, name: str, count: int) -> tuple[float, ...]:
     numbers = [x for x in values if isinstance(x, (int, float))] if is_list else []
     is_rising = all(a < b for a, b in itertools.pairwise([0, *numbers]))
     if not is_rising or not is_list or not len(numbers) == len(values) == count:
-        raise InputError(f"{name} = {values!r} must be {count} positive numbers that rise")
+        raise InputError(f"{name} = {values!r} must be {count} increasing positive numbers")
     return tuple(float(x) for x in numbers)
 
 

@@ -66,10 +66,10 @@ def check_has(state: Any, names: Iterable[str], kind: str) -> None:
         InputError: naming the kind and what is missing.
     """
     if not isinstance(state, Mapping):
-        raise InputError(f"a {type(state).__name__} is no state of {kind}")
+        raise InputError(f"a {type(state).__name__} is not a saved state of {kind}")
     missing = [name for name in names if name not in state]
     if missing:
-        raise InputError(f"this is no state of {kind}: it lacks {', '.join(missing)}")
+        raise InputError(f"not a saved state of {kind}: it lacks {', '.join(missing)}")
 
 
 def _key(attribute: str) -> str:

@@ -319,7 +319,7 @@ def _check_random(value: Mapping[str, Any], like: Mapping[str, Any], where: str)
     except (TypeError, ValueError, KeyError, OverflowError):
         is_taken = False
     if not is_taken:
-        raise wrong(where, f"is no state of {like['bit_generator']}")
+        raise wrong(where, f"is not a state of {like['bit_generator']}")
 
 
 def _is_same(a: Any, b: Any) -> bool:

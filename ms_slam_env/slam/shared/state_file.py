@@ -165,11 +165,11 @@ def _read_array(archive: zipfile.ZipFile, index: int, read: set[str]) -> NDArray
         shape, is_fortran, dtype = readers[version](file)
         size = archive.getinfo(name).file_size - file.tell()
         if dtype.hasobject or size != math.prod(shape) * dtype.itemsize:
-            raise ValueError(f"{name} is not the array that it says")
+            raise ValueError(f"{name} does not match its header")
         data = bytearray()  # in pieces: one copy, not two
         while piece := file.read(_PIECE_BYTES):
             data += piece
     if len(data) != size:
-        raise ValueError(f"{name} is not the array that it says")
+        raise ValueError(f"{name} does not match its header")
     flat = np.frombuffer(data, dtype=dtype)
     return flat.reshape(shape, order="F" if is_fortran else "C")
