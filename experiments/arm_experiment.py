@@ -28,7 +28,7 @@ from ms_slam_env.benchmark.episodes import (
     DEFAULT_STEP_M,
     EpisodeSpec,
     check_episodes,
-    check_names,
+    check_players,
     make_env,
     parse_options,
     play,
@@ -148,7 +148,7 @@ class ArmExperiment(Experiment):
 
     def specs(self) -> list[RunSpec]:
         """Every run; those of one scene and seed are neighbours and share its geometry."""
-        check_names(self.planners, self.scenes)
+        check_players(self.planners, self.scenes)
         options = parse_options(self.options)
         # A run goes on when tracking is lost, as the paper's did.
         options.setdefault("lost_patience", 1_000_000)

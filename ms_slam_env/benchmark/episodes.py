@@ -253,7 +253,7 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
     return result
 
 
-def check_names(planners: Sequence[str], scenes: Sequence[str]) -> None:
+def check_players(planners: Sequence[str], scenes: Sequence[str]) -> None:
     """Refuse unknown planners and scenes, and mesh files that cannot be read.
 
     Raises:
@@ -374,7 +374,7 @@ class EpisodeExperiment(Experiment):
 
     def specs(self) -> list[EpisodeSpec]:
         """Every episode; those of one scene and seed are neighbours and share its geometry."""
-        check_names(self.planners, self.scenes)
+        check_players(self.planners, self.scenes)
         own = {field.name: getattr(self, field.name) for field in fields(self)}
         seeds = seed_list(self.seeds, self.episodes)
         return episode_specs(own, self.scenes, seeds, self.compared())

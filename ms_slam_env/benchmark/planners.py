@@ -13,7 +13,7 @@ from ms_slam_env.benchmark.episodes import (
     DOTS,
     EpisodeSpec,
     check_episodes,
-    check_names,
+    check_players,
     episode_specs,
     run_episode,
     seed_list,
@@ -107,7 +107,7 @@ class PlannerBenchmark(Experiment):
         own = {field.name: getattr(self, field.name) for field in fields(self)}
         given = {key: value for key, value in own.items() if value not in (None, ())}
         shared = {"options": (), **usual, **given, "task": name}
-        check_names(self.planners, shared["scenes"])
+        check_players(self.planners, shared["scenes"])
         compared = [{"planner": planner} for planner in self.planners]
         return episode_specs(shared, shared["scenes"], self._seeds, compared)
 

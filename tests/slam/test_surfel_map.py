@@ -9,7 +9,7 @@ from surfel_scenes import SMALL, build_map, device_poses, fuse, live_frame
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import xtion
 from ms_slam_env.geometry import make_pose, so3_exp
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
@@ -215,7 +215,7 @@ def test_the_view_is_as_thin_as_the_last_iteration_allows(size, stride):
 
 
 def test_a_mirror_writes_and_reads_the_device_array():
-    mirror = HostDeviceBuffer((2,), wp.mat44, "cpu")
+    mirror = SavedBuffer((2,), wp.mat44, "cpu")
     values = np.arange(32.0).reshape(2, 4, 4)
     mirror.write(values)
     np.testing.assert_array_equal(mirror.array.numpy(), values)

@@ -25,8 +25,8 @@ from ms_slam_env.slam.shared.state import Stateful
 Dim = int | Sequence[int]
 
 
-class HostDeviceBuffer(_warp.HostDeviceBuffer, Stateful):
-    """One that is part of a state."""
+class SavedBuffer(_warp.HostDeviceBuffer, Stateful):
+    """A host-device buffer that is part of a saved state."""
 
     def get_state(self) -> dict[str, Any]:
         """The values."""

@@ -23,7 +23,7 @@ from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.shared.state import Saved
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache, fetch, put
+from ms_slam_env.slam.surfel.device import KernelLaunchCache, SavedBuffer, fetch, put
 from ms_slam_env.slam.surfel.preprocessing import LiveFrame, Pieces
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
@@ -393,8 +393,8 @@ class GeometricMotionMask(MotionMask):
         batch, device = self._batch, self._device
         shape = (grid.height, grid.width)
 
-        def images(dtype: type, *more: int) -> HostDeviceBuffer:
-            return HostDeviceBuffer((batch, *more, *shape), dtype, device)
+        def images(dtype: type, *more: int) -> SavedBuffer:
+            return SavedBuffer((batch, *more, *shape), dtype, device)
 
         self._depth, self._nearest = images(wp.float32), images(wp.float32)
         self._found, self._masked = images(wp.int32), images(wp.int32)
@@ -402,12 +402,10 @@ class GeometricMotionMask(MotionMask):
         self._depth_before, self._odds = images(wp.float32), images(wp.float32)
         self._carried = images(wp.float32)
         self._to_past, self._from_past = (
-            HostDeviceBuffer((batch, PAST), wp.mat44, device) for _ in range(2)
+            SavedBuffer((batch, PAST), wp.mat44, device) for _ in range(2)
         )
-        self._to_before, self._from_model = (
-            HostDeviceBuffer(batch, wp.mat44, device) for _ in range(2)
-        )
-        self._age = HostDeviceBuffer((batch, PAST), wp.int32, device)
+        self._to_before, self._from_model = (SavedBuffer(batch, wp.mat44, device) for _ in range(2))
+        self._age = SavedBuffer((batch, PAST), wp.int32, device)
         self._launches = KernelLaunchCache(device)
         self._past_poses = np.tile(np.eye(4), (batch, PAST, 1, 1))
         self._pose_before = np.tile(np.eye(4), (batch, 1, 1))
@@ -636,11 +634,11 @@ class GeometricMotionMask(MotionMask):
         return self._masked.read()[env] > 0
 
 
-def _flat(*buffers: HostDeviceBuffer) -> list[wp.array]:
+def _flat(*buffers: SavedBuffer) -> list[wp.array]:
     return [buffer.array.flatten() for buffer in buffers]
 
 
-def _store(past: HostDeviceBuffer, due: Bool, slots: NDArray[Any], live: Float32) -> None:
+def _store(past: SavedBuffer, due: Bool, slots: NDArray[Any], live: Float32) -> None:
     """Put the images of the envs that are due into their slots."""
     images = past.read()
     images[due, slots[due]] = live[due]

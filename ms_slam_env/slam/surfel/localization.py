@@ -30,7 +30,7 @@ from ms_slam_env.slam.surfel.acceptance import (
     geometric_thresholds,
     is_nearly_accepted,
 )
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.free_space_mask import MotionMask
 from ms_slam_env.slam.surfel.keyframe_search import Images, Relocalization, measure_consistency
 from ms_slam_env.slam.surfel.photometry import (
@@ -165,7 +165,7 @@ class MapAligner:
         self._states = states
         self._map = surfel_map
         self._motion_mask = motion_mask
-        self._device_poses = HostDeviceBuffer(surfel_map.batch, wp.mat44, surfel_map.device)
+        self._device_poses = SavedBuffer(surfel_map.batch, wp.mat44, surfel_map.device)
         self._strict = np.ones(surfel_map.batch, dtype=bool)
         self._view: ModelView
         self._view_poses: Float64 | None = None  # of ``_view``; None: the maps have changed since

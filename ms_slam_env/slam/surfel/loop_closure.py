@@ -31,7 +31,7 @@ from ms_slam_env.slam.shared.ferns import Candidate
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.slam_backend import Loop
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.map_deformation import MapDeformer
 from ms_slam_env.slam.surfel.pose_hypotheses import (
     NUM_HYPOTHESES,
@@ -121,7 +121,7 @@ class InactiveAligner:
         intrinsics = surfel_map.intrinsics
         stride = model_stride(intrinsics, config)
         self._tracker = Tracker(self.batch, NUM_HYPOTHESES, intrinsics, config, device, stride)
-        self._poses = HostDeviceBuffer(self.batch, wp.mat44, device)
+        self._poses = SavedBuffer(self.batch, wp.mat44, device)
 
     def set_frame(self, live: LiveFrame) -> None:
         """Take the frames that are aligned next."""

@@ -40,7 +40,7 @@ from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert, transform_points
 from ms_slam_env.slam.shared.rows import Rows, join
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.rendering import SplatRenderer
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
@@ -541,7 +541,7 @@ class MapDeformer:
         self._tolerance_m = config.fusion_distance_m
         self._stable = config.confidence_threshold
         self._min_cosine = float(np.cos(np.radians(config.fusion_angle_deg)))
-        self._poses = HostDeviceBuffer(surfel_map.batch, wp.mat44, device)
+        self._poses = SavedBuffer(surfel_map.batch, wp.mat44, device)
 
     def deform(
         self, env: int, pose: Float64, corrected: Float64, earlier: Constraints

@@ -18,8 +18,8 @@ from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.surfel.device import (
-    HostDeviceBuffer,
     KernelLaunchCache,
+    SavedBuffer,
     fetch,
     put,
     threads_per_row,
@@ -132,8 +132,8 @@ class ExposureCorrection:
         self._size = intrinsics.shape
         self._columns, threads = threads_per_row(intrinsics.width, device)
         self._dim = (batch * intrinsics.height, threads)
-        self._per_gain = HostDeviceBuffer(batch, wp.float32, device)
-        self._bias = HostDeviceBuffer(batch, wp.float32, device)
+        self._per_gain = SavedBuffer(batch, wp.float32, device)
+        self._bias = SavedBuffer(batch, wp.float32, device)
         self._launches = KernelLaunchCache(device)
 
     def __call__(self, live: LiveFrame, photometry: NDArray[Any]) -> None:

@@ -27,7 +27,7 @@ from ms_slam_env._runtime.warp import RecordedLaunch
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer, fetch, put, threads_per_row
+from ms_slam_env.slam.surfel.device import SavedBuffer, fetch, put, threads_per_row
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
 SIGMA_PX = 1.5  # width of the bilateral depth filter in the image
@@ -248,8 +248,8 @@ class Preprocessor:
         self.config = config
         self.device = device
         shape = (batch, *intrinsics.shape)
-        self._raw_color = HostDeviceBuffer((*shape, 3), wp.uint8, device)
-        self._raw_depth = HostDeviceBuffer(shape, wp.float32, device)
+        self._raw_color = SavedBuffer((*shape, 3), wp.uint8, device)
+        self._raw_depth = SavedBuffer(shape, wp.float32, device)
         self._inverse_depth = wp.zeros(shape, dtype=wp.float32, device=device)
         self.frame = LiveFrame(
             raw_depth=self._raw_depth.array,

@@ -28,7 +28,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import se3_log
 from ms_slam_env.native import native_source
 from ms_slam_env.slam.shared.state import Saved
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.preprocessing import check_images
 
@@ -76,12 +76,12 @@ class _Leveller:
 
     def __init__(self, batch: int, intrinsics: Intrinsics, device: str) -> None:
         shape = (batch, *intrinsics.shape)
-        self._color = HostDeviceBuffer((*shape, 3), wp.uint8, device)
-        self._depth = HostDeviceBuffer(shape, wp.float32, device)
-        self._turn = HostDeviceBuffer(batch, wp.vec3, device)
-        self._step = HostDeviceBuffer(batch, wp.vec3, device)
-        self._levelled_color = HostDeviceBuffer((*shape, 3), wp.uint8, device)
-        self._levelled_depth = HostDeviceBuffer(shape, wp.float32, device)
+        self._color = SavedBuffer((*shape, 3), wp.uint8, device)
+        self._depth = SavedBuffer(shape, wp.float32, device)
+        self._turn = SavedBuffer(batch, wp.vec3, device)
+        self._step = SavedBuffer(batch, wp.vec3, device)
+        self._levelled_color = SavedBuffer((*shape, 3), wp.uint8, device)
+        self._levelled_depth = SavedBuffer(shape, wp.float32, device)
         rows, i = Rows(), intrinsics
         rows.color, rows.depth = self._color.array.flatten(), self._depth.array.flatten()
         rows.turn, rows.step = self._turn.array, self._step.array

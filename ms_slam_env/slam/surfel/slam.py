@@ -25,7 +25,7 @@ from ms_slam_env.slam.shared.ferns import Candidate
 from ms_slam_env.slam.shared.state import Saved, check_has
 from ms_slam_env.slam.slam_backend import TrackResult
 from ms_slam_env.slam.surfel.acceptance import Alignment, with_doubt
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer
+from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask
 from ms_slam_env.slam.surfel.keyframe_search import Images, make_relocalization
 from ms_slam_env.slam.surfel.localization import CameraStates, Localizer, MapAligner
@@ -65,7 +65,7 @@ class BatchedSurfelSlam(Saved):
         self._invalid_frames = self._localizer.invalid_frames
         self._last_frames = self._localizer.last_frames
         dtypes = (wp.mat44, wp.int32, wp.float32, wp.int32)  # of pose, time, weight and mask
-        self._fused = [HostDeviceBuffer(batch, dtype, device) for dtype in dtypes]
+        self._fused = [SavedBuffer(batch, dtype, device) for dtype in dtypes]
         self._use(self._pipelines.get(intrinsics, config))
 
     @property

@@ -21,7 +21,7 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import invert
 from ms_slam_env.slam.shared.alignment_check import DeviceStatistics, DeviceThresholds
 from ms_slam_env.slam.surfel.acceptance import Alignment, assess_alignment
-from ms_slam_env.slam.surfel.device import HostDeviceBuffer, KernelLaunchCache, threads_per_row
+from ms_slam_env.slam.surfel.device import KernelLaunchCache, SavedBuffer, threads_per_row
 from ms_slam_env.slam.surfel.normal_equations import (
     NUM_SUMS,
     OFF,
@@ -51,9 +51,9 @@ class HypothesisBuffers:
     """Host-device buffers of K hypotheses per env."""
 
     def __init__(self, batch: int, k: int, slots: int, device: str) -> None:
-        self.poses = HostDeviceBuffer((batch, k), wp.mat44d, device)
-        self.states = HostDeviceBuffer((batch, k), wp.int32, device)
-        self.photometry = HostDeviceBuffer((batch, k), Photometry, device)
+        self.poses = SavedBuffer((batch, k), wp.mat44d, device)
+        self.states = SavedBuffer((batch, k), wp.int32, device)
+        self.photometry = SavedBuffer((batch, k), Photometry, device)
         arrays = Hypotheses()
         arrays.pose, arrays.state = self.poses.array, self.states.array
         arrays.photometry = self.photometry.array
@@ -275,13 +275,13 @@ class Tracker:
         self._one = HypothesisBuffers(batch, 1, slots, device)
         self._launches = KernelLaunchCache(device)
         self.good_score = GOOD_SCORE
-        self._thresholds = HostDeviceBuffer(batch, DeviceThresholds, device)
-        self._T_world_model = HostDeviceBuffer(batch, wp.mat44d, device)
-        self._predicted = HostDeviceBuffer(batch, wp.mat44d, device)
-        self._T_world_live = HostDeviceBuffer(batch, wp.mat44d, device)
-        self._status = HostDeviceBuffer(batch, wp.int32, device)
-        self._statistics = HostDeviceBuffer(batch, DeviceStatistics, device)
-        self._covariance = HostDeviceBuffer(batch, mat66d, device)
+        self._thresholds = SavedBuffer(batch, DeviceThresholds, device)
+        self._T_world_model = SavedBuffer(batch, wp.mat44d, device)
+        self._predicted = SavedBuffer(batch, wp.mat44d, device)
+        self._T_world_live = SavedBuffer(batch, wp.mat44d, device)
+        self._status = SavedBuffer(batch, wp.int32, device)
+        self._statistics = SavedBuffer(batch, DeviceStatistics, device)
+        self._covariance = SavedBuffer(batch, mat66d, device)
         self._live_levels: list[Level] = []
 
     def _stride(self, level: int, share: float = 1.0) -> int:
