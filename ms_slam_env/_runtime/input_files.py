@@ -80,10 +80,20 @@ def read_json(path: str | Path, kind: str, most_bytes: int = MAX_TEXT_BYTES) -> 
         InputError: also what is no JSON, is nested too deeply, or has a number of thousands of
             digits.
     """
-    text = read_text(path, kind, most_bytes)
+    return parse_json(read_text(path, kind, most_bytes), path)
+
+
+def parse_json(text: str | bytes, path: str | Path) -> Any:
+    """What the JSON text of file ``path`` says.
+
+    Raises:
+        InputError: as `read_json`.
+    """
     try:
         return json.loads(text)
-    except (ValueError, RecursionError) as error:
+    except RecursionError:
+        raise InputError(f"{path} is not a JSON file: it is nested too deeply") from None
+    except ValueError as error:
         raise InputError(f"{path} is not a JSON file: {str(error).splitlines()[0]}") from None
 
 

@@ -14,7 +14,6 @@ of it. Every reader takes either form.
 
 from __future__ import annotations
 
-import json
 import lzma
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
-from ms_slam_env._runtime.input_files import is_named, read_bytes, read_json
+from ms_slam_env._runtime.input_files import is_named, parse_json, read_bytes, read_json
 from ms_slam_env._runtime.output_files import check_out_folder, write_bytes, write_text
 from ms_slam_env._runtime.result_folders import result_folder
 from ms_slam_env.errors import InputError
@@ -244,9 +243,9 @@ def _unpacked(path: Path) -> Any:
         text = unpacker.decompress(data, max_length=_MAX_BYTES)
         if not unpacker.eof:
             raise lzma.LZMAError(f"cut short, or larger than {_MAX_BYTES / 1e6:.0f} MB unpacked")
-        return json.loads(text)
-    except (lzma.LZMAError, ValueError) as error:
+    except lzma.LZMAError as error:
         raise InputError(f"{path} is not a packed JSON file: {error}") from None
+    return parse_json(text, path)
 
 
 def pack_results(source: Path, target: Path) -> list[Path]:

@@ -107,7 +107,7 @@ def test_packed_results_make_the_same_pages(
     [
         (b"{}", "not a packed JSON file"),
         (lzma.compress(b"{}")[:-4], "cut short"),
-        (lzma.compress(b"{"), "not a packed JSON file"),
+        (lzma.compress(b"{"), "not a JSON file"),
         (lzma.compress(b"[" * 100_000), "nested too deeply"),
         (lzma.compress(b" " * 30_000_000, preset=0), "larger than 20 MB unpacked"),
     ],
