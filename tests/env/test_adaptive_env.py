@@ -116,7 +116,10 @@ def test_vector_environments(mode):
         ({"adaptation": "none"}, "adaptation must be 'agent'"),
         ({"adaptation": "clever"}, "valid choices: none, divergence, agent|'none' or 'divergence'"),
         ({"slam": "odometry"}, "only the SLAM backend 'surfel'"),
-        ({"adaptation": {"name": "agent", "costs": [1, 2]}}, "costs = .* must be 3 positive"),
+        (
+            {"adaptation": {"name": "agent", "costs": [1, 2]}},
+            "costs = .* must be 3 increasing positive",
+        ),
         (
             {"adaptation": {"name": "agent", "configurations": [{}, {}]}},
             r"configurations\[0\] has no about.cost",

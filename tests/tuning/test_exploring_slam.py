@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ms_slam_experiments.shared.sampler_studies import Grid
 from scipy.spatial import cKDTree
 
 from ms_slam_env import slam
@@ -35,7 +36,6 @@ from ms_slam_env.tuning import exploration as exploration_module
 from ms_slam_env.tuning.evaluator import CLOCKS, summarise, worst_ratio
 from ms_slam_env.tuning.held_out import compare_configurations
 from ms_slam_env.tuning.objectives import METRICS, as_metrics, key_of
-from ms_slam_env.tuning.samplers import Grid
 
 FRAMES = 12
 
