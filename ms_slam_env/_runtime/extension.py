@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -40,6 +41,7 @@ class ExtensionPoint:
         own: our names and what they stand for; a text ``module:name`` is imported when it is asked
             for.
         form: of the names that a user makes up.
+        elsewhere: patterns of names that mean something in another place alone, and what to say.
     """
 
     kind: str
@@ -47,6 +49,7 @@ class ExtensionPoint:
     base: type | None = None
     own: Mapping[str, Any] = field(default_factory=dict)
     form: str = "module:Class"
+    elsewhere: Mapping[str, str] = field(default_factory=dict)
 
     def names(self) -> tuple[str, ...]:
         """Our names, and those of the installed entry points."""
@@ -67,6 +70,9 @@ class ExtensionPoint:
         if name in self.own:
             own = self.own[name]
             return self._load(name, own, "") if isinstance(own, str) and ":" in own else own
+        for pattern, hint in self.elsewhere.items():
+            if re.match(pattern, name):
+                raise InputError(f"{self.kind} {name!r}: {hint}")
         if ":" in name:
             # A console script, unlike ``python -m``, leaves the current folder out. It stays, since
             # worker processes, which get this path, import the module too; and it comes last, so

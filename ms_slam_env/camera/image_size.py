@@ -31,6 +31,10 @@ _CHOICES = (
 )
 
 
+class ImageSizeError(InputError):
+    """Images that cannot be brought to the size that was asked for."""
+
+
 @dataclass(frozen=True)
 class Crop:
     """A part of an image, in its pixels: from ``left``, ``top`` on, ``width`` x ``height``."""
@@ -64,18 +68,20 @@ class ImageSize:
             name: of the thing that has these images, for the error message.
 
         Raises:
-            InputError: a part or a size that is larger, or whole images of another aspect; the
-                message says what would do.
+            ImageSizeError: a part or a size that is larger, or whole images of another aspect;
+                the message says what would do.
         """
         whole, fitting = (source.width, source.height), self._fitting(source)
         if self.crop is not None and (self.crop[0] > whole[0] or self.crop[1] > whole[1]):
-            raise InputError(f"{name}: images of {_text(whole)} have no part of {_text(self.crop)}")
+            raise ImageSizeError(
+                f"{name}: images of {_text(whole)} have no part of {_text(self.crop)}"
+            )
         part = self.crop or (fitting if self.crops else whole)
         if self.size is not None and not self._reduces(part):
             remedies = f"valid choices: {NATIVE}"
             if self._reduces(fitting):
                 remedies += f", {_text(self.size)}+crop, which takes their central {_text(fitting)}"
-            raise InputError(
+            raise ImageSizeError(
                 f"{name}: images of {_text(part)} cannot be reduced to {_text(self.size)}; "
                 f"{remedies}"
             )

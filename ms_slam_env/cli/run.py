@@ -44,8 +44,8 @@ class Arguments:
     """SLAM backend; by default that of the configuration file, else surfel."""
     image_size: str | None = None
     """Reduce the images to this size, such as 160x120; 160x120+crop first crops them centrally to
-    that aspect ratio, 160x120+crop=480x360 to that size. By default that of the configuration file,
-    else "native"."""
+    that aspect ratio, 160x120+crop=480x360 to that size. By default that of the configuration file
+    or of the map, else "native": of a rendered sequence 160x120."""
     layout: str = "auto"
     """auto, tum, icl-nuim, 7-scenes, folder, replica, euroc, kitti or bag."""
     intrinsics: str | None = None
@@ -64,7 +64,8 @@ class Arguments:
     budget,share=0.5 and so on. The poses of skipped frames are predicted."""
     map_in: Path | None = None
     """Resume from the map in this file, written by --map-out of another run; the camera is
-    relocalised in it. Backend and parameters come from the file."""
+    relocalised in it. Backend, parameters and image size come from the file; a backend of your own
+    (module:Class) must be named again, with --params as before."""
     map_out: Path | None = None
     """Save the map to this file, to resume from with --map-in."""
     mesh: bool = False
@@ -84,6 +85,7 @@ def main(arguments: Sequence[str]) -> int:
 
         POINT.find(args.backend)  # report a typo before the slow imports
     from ms_slam_env._runtime.parallel import limit_threads
+    from ms_slam_env.camera.image_size import ImageSizeError
     from ms_slam_env.config import from_dict, nested_options
     from ms_slam_env.evaluation.run_sequence import lost_throughout
     from ms_slam_env.evaluation.run_to_folder import run_to_folder
@@ -101,26 +103,32 @@ def main(arguments: Sequence[str]) -> int:
     slam = SlamConfiguration(slam=args.backend or "surfel")
     if args.config is not None and args.map_in is not None:
         raise InputError("--config and --map-in both say the backend and its parameters; give one")
-    source = args.config or args.map_in
-    if source is not None:
-        read = read_configuration if args.config else configuration_of_map
-        slam = read(source)
+    if args.config is not None:
+        slam = read_configuration(args.config)
         if args.backend not in (None, slam.slam):
-            raise InputError(f"--backend {args.backend} but {source} is of {slam.slam}")
+            raise InputError(f"--backend {args.backend} but {args.config} is of {slam.slam}")
+    if args.map_in is not None:
+        slam = configuration_of_map(args.map_in, args.backend, nested_options(args.params))
     if args.map_out is not None:
         check_out_file(args.map_out)
     given = None
     if args.intrinsics is not None:
         given = parse_calibration(args.intrinsics.replace(",", " ").split(), "--intrinsics")
-    sequence = open_sequence(
-        args.sequence,
-        args.image_size or slam.image_size,
-        every=slam.keep_every,
-        layout=args.layout,
-        intrinsics=given,
-        register=args.register,
-        topics=from_dict(Topics, nested_options(args.topics), "topics"),
-    )
+    try:
+        sequence = open_sequence(
+            args.sequence,
+            args.image_size or slam.image_size,
+            every=slam.keep_every,
+            layout=args.layout,
+            intrinsics=given,
+            register=args.register,
+            topics=from_dict(Topics, nested_options(args.topics), "topics"),
+        )
+    except ImageSizeError as error:
+        if args.image_size is not None or args.map_in is None:
+            raise
+        asked = f"{args.map_in} was made at {slam.image_size}, which is kept"
+        raise InputError(f"{error} ({asked})") from None
     registration = getattr(sequence.frames, "registration", None)
     if registration is not None:
         print(registration, file=sys.stderr)

@@ -53,6 +53,7 @@ from ms_slam_env.sequences.trajectory import (
     write_trajectory,
 )
 from ms_slam_env.slam.frame_selection import EveryFrameConfig, FrameSelectionConfig
+from ms_slam_env.slam.slam_backend import check_saves
 
 TRAJECTORY, UNFINISHED = "trajectory.txt", "trajectory.incomplete.txt"
 CORRECTED, TRUTH = "trajectory.corrected.txt", "groundtruth.txt"
@@ -126,7 +127,10 @@ def run_to_folder(
         check_open3d()
     meter = metrics.CostMeter(str(params.get("device", "cpu")), core_watts=core_watts)
     selection = selection or EveryFrameConfig()
-    system = selection.manage(slam.make(backend, sequence.intrinsics, **params))
+    made = slam.make(backend, sequence.intrinsics, **params)
+    system = selection.manage(made)
+    if map_out is not None:
+        check_saves(made)
     if map_in is not None:
         system.load(map_in)
     run = SequenceRun(system, sequence, meter=meter, progress=sequence.name, reset=map_in is None)

@@ -9,11 +9,14 @@ from ms_slam_env.slam.configuration import (
     write_configuration,
 )
 from ms_slam_env.slam.registry import BACKENDS, POINT, check_parameters
-from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult, Views
+from ms_slam_env.slam.shared.state import Saved
+from ms_slam_env.slam.slam_backend import BorrowedMap, SlamBackend, TrackResult, Views
 
 __all__ = [
     "BACKENDS",
     "POINT",
+    "BorrowedMap",
+    "Saved",
     "SlamBackend",
     "SlamConfiguration",
     "TrackResult",

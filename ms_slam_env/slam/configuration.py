@@ -16,9 +16,9 @@ from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env._runtime.parallel import limited_threads
 from ms_slam_env.camera import Intrinsics, parse_image_size
 from ms_slam_env.config import Checked, bounded, from_dict, load_yaml
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.slam.machine import CompilerOptions, compiled, limited_clock
-from ms_slam_env.slam.registry import backend_name, check_parameters, make_backend
+from ms_slam_env.slam.registry import BACKENDS, backend_name, check_parameters, make_backend
 from ms_slam_env.slam.shared.state_file import read_about
 from ms_slam_env.slam.slam_backend import SlamBackend
 
@@ -107,41 +107,91 @@ def make(
     return make_backend(name, intrinsics, params)
 
 
-def open_map(path: str | Path, lost: bool = True, **params: Any) -> SlamBackend:
+def open_map(
+    path: str | Path,
+    lost: bool = True,
+    backend: str | type[SlamBackend] | None = None,
+    **params: Any,
+) -> SlamBackend:
     """Make the backend that wrote a map, for the same camera, and let it go on in the map.
 
     Args:
         path: of a file that ``SlamBackend.save`` wrote.
         lost: whether the camera is somewhere else by now; see ``SlamBackend.load``.
+        backend: the backend, where it is not one of ``BACKENDS``: a file never says whose code
+            runs. Its parameters are then ``params`` alone, which must be those it had.
         params: of the backend, before those that it had.
 
     Raises:
-        InputError: as ``SlamBackend.load``; the map of a backend that is not ours; a parameter that
-            is unknown, or with which the map does not fit.
+        InputError: as ``SlamBackend.load``; the map of another backend, or of one that must be
+            named; a parameter that is unknown, or with which the map does not fit.
     """
-    intrinsics = _part(read_about(Path(path)), "intrinsics", path)
-    saved = configuration_of_map(path)
+    about = read_about(Path(path))
+    intrinsics = _part(about, "intrinsics", path)
     camera = from_dict(Intrinsics, intrinsics, f"{path}: intrinsics")
+    name, saved = _maker(about, path, backend, params)
     try:
-        made = make_backend(saved.slam, camera, merged(saved.slam_config, params))
+        made = make_backend(name, camera, merged(saved, params))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     made.load(path, lost)
     return made
 
 
-def configuration_of_map(path: str | Path) -> SlamConfiguration:
-    """Backend and parameters that wrote a map.
+def configuration_of_map(
+    path: str | Path, backend: str | None = None, params: Mapping[str, Any] | None = None
+) -> SlamConfiguration:
+    """Backend, parameters and image size that wrote a map.
+
+    Args:
+        path: of the file.
+        backend: as ``open_map`` takes it; it must be made with ``params``.
+        params: parameters that are given besides.
 
     Raises:
-        InputError: no such file, no map, or the map of a backend that is not ours.
+        InputError: no such file, no map, the map of another backend, or of one that must be named,
+            or needs parameters besides.
     """
     about = read_about(Path(path))
+    name, own = _maker(about, path, backend, params or {})
+    camera = about.get("intrinsics")
+    size = None
+    if isinstance(camera, Mapping) and {"width", "height"} <= camera.keys():
+        size = f"{camera['width']}x{camera['height']}"
     try:
-        name = backend_name(about.get("backend"))
-        return SlamConfiguration(name, dict(_part(about, "config", path)))
+        return SlamConfiguration(name, own, size)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def _maker(
+    about: Mapping[str, Any], path: str | Path, backend: Any, given: Mapping[str, Any]
+) -> tuple[Any, dict[str, Any]]:
+    """The backend that wrote a map, and its parameters if it is one of ours.
+
+    Of a user's only the names of its parameters are taken from the file: they must be ``given``.
+    """
+    cls, module = about.get("backend"), about.get("module")
+    own = backend_name(cls, module)
+    if own is not None:
+        if backend not in (None, own):
+            raise InputError(f"{path} holds a map of {own}, not of {backend}")
+        return own, dict(_part(about, "config", path))
+    if not isinstance(cls, str):
+        raise InputError(f"{path}: {unknown('SLAM backend', cls, BACKENDS)}")
+    if backend is None:
+        told = f"{module}:{cls}" if module else f"{cls}"
+        raise InputError(
+            f"{path} holds a map of {told!r}, none of {', '.join(BACKENDS)}: name that backend as "
+            "well, as in --backend module:Class or open_map(..., backend=...)"
+        )
+    options = about.get("options")
+    for option, value in options.items() if isinstance(options, Mapping) else ():
+        if option not in given:
+            raise InputError(
+                f"{path} was made with option {option!r} = {str(value)!r}: give it again"
+            )
+    return backend, {}
 
 
 def _part(about: Mapping[str, Any], key: str, path: str | Path) -> Mapping[str, Any]:

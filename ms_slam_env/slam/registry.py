@@ -42,7 +42,16 @@ _OWN = {
 BACKENDS: tuple[str, ...] = tuple(_OWN)
 """Names of our backends."""
 
-POINT = ExtensionPoint("SLAM backend", "ms_slam_env.slam", SlamBackend, own=_OWN)
+POINT = ExtensionPoint(
+    "SLAM backend",
+    "ms_slam_env.slam",
+    SlamBackend,
+    own=_OWN,
+    elsewhere={
+        "([^=,:]+=)?command:": "an external program is run by ms-slam compare alone, as in "
+        "ms-slam compare --backends 'NAME=command:PROGRAM --in {sequence} --out {trajectory}'"
+    },
+)
 """Where backends are found; a user's class is made of intrinsics and its options as keywords."""
 
 
@@ -57,22 +66,18 @@ def make_backend(name: object, intrinsics: Intrinsics, params: Mapping[str, Any]
     entry = POINT.find(name)
     if not isinstance(entry, BackendEntry):
         own: SlamBackend = entry(intrinsics, **params)
+        own.options = dict(params)
         return own
     device = [params.get("device", "cpu")] if entry.has_devices else []
     made: SlamBackend = entry.load(entry.backend)(intrinsics, config, *device)
     return made
 
 
-def backend_name(cls_name: object) -> str:
-    """Name of our backend whose class has this name.
-
-    Raises:
-        InputError: none of ours has.
-    """
+def backend_name(cls_name: object, module: object = None) -> str | None:
+    """Name of our backend whose class has this name, in a ``module`` of ours; None if none has."""
     names = {entry.backend: name for name, entry in _OWN.items()}
-    if not isinstance(cls_name, str) or cls_name not in names:
-        raise unknown("SLAM backend", cls_name, names)
-    return names[cls_name]
+    is_ours = module is None or str(module).startswith("ms_slam_env.")
+    return names.get(cls_name) if is_ours and isinstance(cls_name, str) else None
 
 
 def check_parameters(name: object, params: object) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import as_numbers
 from ms_slam_env.slam.shared.state import Stateful
 from ms_slam_env.slam.shared.state_check import check_like
-from ms_slam_env.slam.shared.state_file import read_state, write_state
+from ms_slam_env.slam.shared.state_file import check_packable, read_state, write_state
 from ms_slam_env.slam.shared.submap_frames import Submaps, one_submap
 
 LARGEST_CUTOFF_M = 12.0
@@ -128,10 +128,12 @@ class SlamBackend(Stateful):
     Attributes:
         intrinsics: of every frame.
         config: the parameters, a dataclass; None for a backend that has none.
+        options: those that a user's backend was made with by its name; a saved map names them.
     """
 
     intrinsics: Intrinsics
     config: Any = None
+    options: Mapping[str, Any] | None = None
 
     @abstractmethod
     def reset(self, T_world_camera: ArrayLike | None = None) -> None:
@@ -234,11 +236,10 @@ class SlamBackend(Stateful):
         """Write map and pose to a file, whole or not at all; `load` reads it.
 
         Raises:
+            InputError: the state or the configuration holds what such a file cannot.
             OSError: nothing can be written there.
         """
-        config = None if self.config is None else asdict(self.config)
-        about = {"backend": type(self).__name__, "intrinsics": _camera(self), "config": config}
-        write_state(Path(path), about, self.get_state())
+        write_state(Path(path), _origin(self), _state_of(self))
 
     def load(self, path: str | Path, lost: bool = True) -> None:
         """Take the map from a file that `save` of such a backend wrote, and go on mapping in it.
@@ -267,14 +268,66 @@ class SlamBackend(Stateful):
             self.mark_lost()
 
 
+def check_saves(backend: SlamBackend) -> None:
+    """Refuse a backend whose map cannot be saved, before any work is done.
+
+    Raises:
+        InputError: naming the part of its state or configuration that a file cannot hold.
+    """
+    check_packable(_origin(backend), _state_of(backend))
+
+
+def _origin(backend: SlamBackend) -> dict[str, Any]:
+    """What a file says of the backend that wrote it."""
+    config = backend.config
+    if config is not None and (not is_dataclass(config) or isinstance(config, type)):
+        raise InputError(
+            f"{type(backend).__name__}.config = {config!r} must be a dataclass or None"
+        )
+    origin = {
+        "backend": type(backend).__name__,
+        "module": type(backend).__module__,
+        "intrinsics": _camera(backend),
+        "config": None if config is None else asdict(config),
+    }
+    if backend.options is not None:
+        origin["options"] = {name: repr(value) for name, value in backend.options.items()}
+    return origin
+
+
+def _state_of(backend: SlamBackend) -> dict[str, Any]:
+    cannot = f"a map of {type(backend).__name__} cannot be saved: its get_state"
+    try:
+        state = backend.get_state()
+    except NotImplementedError:
+        raise InputError(f"{cannot} is not implemented") from None
+    if not isinstance(state, Mapping):
+        raise InputError(f"{cannot} returned a {type(state).__name__}, not a mapping")
+    return state
+
+
 def _check_origin(backend: SlamBackend, about: Mapping[str, Any], path: str | Path) -> None:
     """Refuse the map of another backend or camera."""
     name = type(backend).__name__
     if about.get("backend") != name:
         raise InputError(f"{path} holds a map of {about.get('backend')}, not of {name}")
     own, saved = _camera(backend), about.get("intrinsics")
-    if saved != own:
-        raise InputError(f"{path} holds a map of another camera: {saved}, not {own}")
+    if not isinstance(saved, Mapping) or set(saved) != set(own):
+        raise InputError(f"{path} does not say which camera made its map")
+    sizes = [f"{camera['width']}x{camera['height']}" for camera in (saved, own)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"{path} holds a map made from images of {sizes[0]}, not {sizes[1]}; "
+            f"continue at --image-size {sizes[0]}"
+        )
+    others = [key for key in own if saved[key] != own[key]]
+    if others:
+        said = "; ".join(f"{key} {_short(saved[key])}, not {_short(own[key])}" for key in others)
+        raise InputError(f"{path} holds a map of another camera: {said}")
+
+
+def _short(number: Any) -> str:
+    return f"{number:.9g}" if isinstance(number, float) else repr(number)
 
 
 def _camera(backend: SlamBackend) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from ms_slam_env import slam
 from ms_slam_env.benchmark.command_runs import check_command, run_command
 from ms_slam_env.benchmark.compare import Compare
 from ms_slam_env.cli import main
+from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.metrics import ate_rmse
@@ -166,10 +167,15 @@ def test_no_shell_reads_the_command(tmp_path) -> None:
     assert words[-3:] == [";", "touch", str(target)]
 
 
-def test_no_file_can_name_a_command() -> None:
+def test_no_file_can_name_a_command(capsys: pytest.CaptureFixture[str]) -> None:
     # The backends of configurations, maps and environments are looked up here.
-    with pytest.raises(InputError):
-        POINT.find("command:prog {sequence} {trajectory}")
+    for name in ("command:prog {sequence} {trajectory}", "orb=command:prog {sequence}"):
+        with pytest.raises(InputError, match="an external program is run by ms-slam compare alone"):
+            POINT.find(name)
+    assert main(["run", "table:2000", "--backend", "command:prog {sequence} {trajectory}"]) == 2
+    assert "ms-slam compare --backends 'NAME=command:PROGRAM" in capsys.readouterr().err
+    with pytest.raises(InputError, match="run by ms-slam compare alone"):
+        ActiveSlamEnv(slam="command:prog {sequence} {trajectory}")
 
 
 OURS = """

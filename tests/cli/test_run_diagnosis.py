@@ -11,7 +11,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from ms_slam_env import slam
-from ms_slam_env.camera import RGBDFrame, xtion
+from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import SequenceRun
@@ -111,11 +111,37 @@ def test_the_command_takes_backend_and_parameters_from_the_map(tmp_path, capsys)
     backend = slam.make("surfel", xtion("80x60"), max_surfels=60_000, icp_rgb_weight=0.3)
     backend.save(stored)
     assert main([*command, "--map-in", str(stored), "--backend", "sparse"]) == 2
-    assert "is of surfel" in capsys.readouterr().err
-    assert main([*command[:2], "--image-size", "160x120", "--map-in", str(stored)]) == 2
-    assert "another camera" in capsys.readouterr().err
+    assert "holds a map of surfel, not of sparse" in capsys.readouterr().err
     assert main([*command, "--map-in", str(tmp_path / "none.npz")]) == 2
     assert "No such file" in capsys.readouterr().err
+
+
+def test_a_second_session_takes_the_image_size_of_the_map(tmp_path, capsys):
+    """By default; another size, camera or aspect is one line that says what differs."""
+    stored, wide = tmp_path / "map.npz", tmp_path / "wide.npz"
+    sequence = ["run", "table:2000:handheld,frames=3", "--out", str(tmp_path / "out")]
+    assert main([*sequence, "--image-size", "80x60", "--map-out", str(stored)]) == 0
+    assert main([*sequence, "--map-in", str(stored)]) == 0  # rendered at 160x120 otherwise
+    capsys.readouterr()
+    assert main([*sequence, "--image-size", "160x120", "--map-in", str(stored)]) == 2
+    assert capsys.readouterr().err.endswith(
+        f"{stored} holds a map made from images of 80x60, not 160x120; "
+        "continue at --image-size 80x60\n"
+    )
+    slam.make("surfel", Intrinsics(70, 71.2875, 40, 29.5, 80, 60)).save(stored)
+    assert main([*sequence, "--map-in", str(stored)]) == 2
+    assert capsys.readouterr().err.endswith(
+        "holds a map of another camera: fx 70, not 71.2875; cx 40, not 39.5\n"
+    )
+    folder = tmp_path / "recording"
+    assert main(["generate", "--scene", "table", "--path.frames", "2", "--image-size", "80x60",
+                 "--out", str(folder)]) == 0  # fmt: skip
+    slam.make("surfel", xtion("80x40")).save(wide)
+    capsys.readouterr()
+    assert main(["run", str(folder), "--map-in", str(wide)]) == 2
+    said = capsys.readouterr().err
+    assert "images of 80x60 cannot be reduced to 80x40" in said
+    assert said.endswith(f"({wide} was made at 80x40, which is kept)\n")
 
 
 def test_sparse_without_colour_is_refused(sequence):

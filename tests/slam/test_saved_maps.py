@@ -183,7 +183,7 @@ def _with_flipped_bytes(data: bytes) -> bytes:
 def test_another_backend_camera_or_version_is_named(saved, tmp_path):
     assert "a map of SurfelSlam, not of OdometrySlam" in _refusal(saved, "odometry")
     other = slam.make("surfel", xtion("80x60"), max_surfels=60_000)
-    with pytest.raises(InputError, match="another camera"):
+    with pytest.raises(InputError, match="made from images of 160x120, not 80x60; continue at"):
         other.load(saved)
     path = tmp_path / "version.npz"
     with zipfile.ZipFile(saved) as old, zipfile.ZipFile(path, "w") as new:

@@ -48,17 +48,39 @@ def write_state(path: Path, about: Mapping[str, Any], state: Mapping[str, Any]) 
         path: of the file.
         about: what the state is of, in JSON's types.
         state: as ``Stateful.get_state`` returns it.
+
+    Raises:
+        InputError: as `check_packable`.
+        OSError: nothing can be written there.
     """
-    arrays: list[NDArray[Any]] = []
-    tree = _packed(state, arrays)
-    header = {"format": FORMAT, "version": VERSION, "about": about, "state": tree}
+    header, arrays = _header(about, state)
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        archive.writestr(zipfile.ZipInfo(_TREE), json.dumps(header), zipfile.ZIP_DEFLATED)
+        archive.writestr(zipfile.ZipInfo(_TREE), header, zipfile.ZIP_DEFLATED)
         for index, array in enumerate(arrays):
             with archive.open(zipfile.ZipInfo(_name(index)), "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, array, allow_pickle=False)
     write_bytes(path, data.getvalue())
+
+
+def check_packable(about: Mapping[str, Any], state: Mapping[str, Any]) -> None:
+    """Refuse what `write_state` cannot write, or would be read back as something else.
+
+    Raises:
+        InputError: naming the place and what may stand there.
+    """
+    _header(about, state)
+
+
+def _header(about: Mapping[str, Any], state: Mapping[str, Any]) -> tuple[str, list[NDArray[Any]]]:
+    """``tree.json`` as text, and the arrays beside it."""
+    arrays: list[NDArray[Any]] = []
+    tree = _packed(state, arrays, "state")
+    header = {"format": FORMAT, "version": VERSION, "about": about, "state": tree}
+    try:
+        return json.dumps(header), arrays
+    except (TypeError, ValueError) as error:  # the tree is JSON by now
+        raise InputError(f"a map cannot be saved with these parameters: {error}") from None
 
 
 def read_state(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -123,18 +145,34 @@ def _name(index: int) -> str:
     return f"{index}.npy"
 
 
-def _packed(value: Any, arrays: list[NDArray[Any]]) -> Any:
+def _packed(value: Any, arrays: list[NDArray[Any]], where: str) -> Any:
     """``value`` in JSON's types; its arrays, and numbers of NumPy, are added to ``arrays``."""
     if isinstance(value, (np.ndarray, np.generic)):
+        if value.dtype.hasobject:
+            raise _unpackable(where, "an array of objects")
         kind = "array" if isinstance(value, np.ndarray) else "number"
         arrays.append(np.asarray(value))
         return {kind: len(arrays) - 1}
     if isinstance(value, Mapping):
-        return {"mapping": {str(name): _packed(one, arrays) for name, one in value.items()}}
+        for name in value:
+            if not isinstance(name, str):
+                raise _unpackable(where, f"a mapping with the key {name!r}, not text")
+        packed = {name: _packed(one, arrays, f"{where}.{name}") for name, one in value.items()}
+        return {"mapping": packed}
     for container, made in _CONTAINERS.items():
         if isinstance(value, made):
-            return {container: [_packed(one, arrays) for one in value]}
+            packed_list = [_packed(one, arrays, f"{where}[{k}]") for k, one in enumerate(value)]
+            return {container: packed_list}
+    if value is not None and not isinstance(value, (bool, int, float, str)):
+        raise _unpackable(where, f"a {type(value).__name__}")
     return value
+
+
+def _unpackable(where: str, what: str) -> InputError:
+    return InputError(
+        f"a map cannot be saved: {where} is {what}; a file holds numbers, text, arrays, and lists, "
+        "tuples and mappings of these"
+    )
 
 
 def _unpacked(tree: Any, array: Callable[[int], NDArray[Any]]) -> Any:
