@@ -97,7 +97,7 @@ def disturbed() -> Task:
 OWN = {"room": room, "home": home, "arm": arm, "disturbed": disturbed}
 """The built-in tasks; together they form the leaderboard."""
 
-TASKS = ExtensionPoint("task", "ms_slam_env.tasks", own=OWN, form="module:function")
+TASKS = ExtensionPoint("task", "ms_slam_env.tasks", own=OWN, form="module:function", takes=())
 """Lookup of tasks by name: functions that return a `Task`."""
 
 

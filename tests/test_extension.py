@@ -29,6 +29,7 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.cli.train import TRAINERS
 from ms_slam_env.env import env_config as config
 from ms_slam_env.env import observations
+from ms_slam_env.env.observations import PixelsObservation
 from ms_slam_env.env.planners import PLANNERS, check_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import registry
@@ -166,6 +167,86 @@ def test_a_reward_is_a_function_or_weights(module):
     with pytest.raises(InputError, match=r"reward = 3 must be a function .* new_surface"):
         config.make_config({"reward": 3})
     assert config.make_config({"reward": {"lost": 2.0}}).reward == config.RewardConfig(lost=2.0)
+
+
+class Explore:
+    """A reward whose objects are functions of an outcome."""
+
+    def __call__(self, outcome):
+        return {"new_surface": outcome.new_surface_m2, "lost": -0.5 * (not outcome.tracking_ok)}
+
+
+class Weighted(Explore):
+    def __init__(self, weight):
+        self.weight = weight
+
+
+class Half(PixelsObservation):
+    build = observations.Observation.build  # abstract again
+
+
+class NoArguments(PixelsObservation):
+    def __init__(self):
+        pass
+
+
+class NoSpace(PixelsObservation):
+    def __init__(self, intrinsics, num_motions):
+        pass
+
+
+def test_a_reward_may_be_a_class(module):
+    """Its object is made; an object and the function are the same reward."""
+    by_class = play({**ENV, "reward": Explore})
+    assert by_class == play({**ENV, "reward": Explore()}) == play(ENV)
+    assert config.make_config({"reward": config.RewardConfig}).reward == config.RewardConfig()
+    for reward, said in (
+        (Weighted, "is a class that takes arguments; give an object of it"),
+        (dict, r"whose objects are not callable; give a function of an Outcome, or a class"),
+        (lambda: 1.0, r"must be callable as <lambda>\(outcome\): too many positional arguments"),
+        (lambda a, b: 1.0, r"<lambda>\(outcome\): missing a required argument: 'b'"),
+    ):
+        with pytest.raises(InputError, match=said):
+            config.make_config({"reward": reward})
+
+
+@pytest.mark.parametrize("value", ["much", None, [1, 2], {"a": "much"}])
+def test_a_reward_that_is_no_number_is_refused(value):
+    env = gym.make(ENV["id"], scene="table", image_size="80x60", reward=lambda outcome: value)
+    env.reset(seed=0)
+    with pytest.raises(InputError, match=r"reward .* returned .*; it must return a number, or a m"):
+        env.step(0)
+
+
+def test_what_is_called_in_another_way_is_refused_where_it_is_named():
+    camera = xtion("80x60")
+    of_class = observations.make_observation("pixels", camera, 49)
+    for point, thing, said in (
+        (observations.POINT, Half, "Half'> does not define build"),
+        (observations.POINT, NoArguments, r"callable as NoArguments\(intrinsics, num_motions\)"),
+        (observations.POINT, of_class, "is an object; give its class, PixelsObservation"),
+        (slam.POINT, slam.make("surfel", camera), "is an object; give its class, SurfelSlam"),
+        (scene_registry.POINT, Explore, r"must be callable as Explore\(seed\): too many"),
+        (
+            TASKS,
+            lambda name: None,
+            r"callable as <lambda>\(\): missing a required argument: 'name'",
+        ),
+    ):
+        with pytest.raises(InputError, match=said):
+            point.find(thing)
+    with pytest.raises(InputError, match="has no space; its constructor must set one"):
+        observations.make_observation(NoSpace, camera, 49)
+
+
+def test_a_backend_that_needs_an_option_says_which(module):
+    class Needy(module.PhotometricSlam):
+        def __init__(self, intrinsics, weight):
+            super().__init__(intrinsics, weight)
+
+    with pytest.raises(InputError, match=r"Needy\(intrinsics\): missing a required argument: 'wei"):
+        slam.make(Needy, xtion("80x60"))
+    assert slam.make(Needy, xtion("80x60"), weight=0.25).config.icp_rgb_weight == 0.25
 
 
 def test_a_scene_that_is_none_is_refused(module):

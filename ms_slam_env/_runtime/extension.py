@@ -41,6 +41,7 @@ class ExtensionPoint:
         own: our names and what they stand for; a text ``module:name`` is imported when it is asked
             for.
         form: of the names that a user makes up.
+        takes: names of what it is called with, in order; None where that differs.
         elsewhere: patterns of names that mean something in another place alone, and what to say.
     """
 
@@ -49,6 +50,7 @@ class ExtensionPoint:
     base: type | None = None
     own: Mapping[str, Any] = field(default_factory=dict)
     form: str = "module:Class"
+    takes: tuple[str, ...] | None = None
     elsewhere: Mapping[str, str] = field(default_factory=dict)
 
     def names(self) -> tuple[str, ...]:
@@ -64,6 +66,10 @@ class ExtensionPoint:
                 that cannot be loaded, or something of another kind.
         """
         if not isinstance(name, str):
+            if self.base is not None and isinstance(name, self.base):
+                raise InputError(
+                    f"{self.kind} {name!r} is an object; give its class, {type(name).__name__}"
+                )
             if not callable(name):
                 raise self.unknown(name)
             return self._checked(name, name)
@@ -117,6 +123,11 @@ class ExtensionPoint:
             raise InputError(
                 f"{self.kind} {name!r} is not a subclass of {module}.{self.base.__name__}"
             )
+        if inspect.isabstract(found):
+            missing = ", ".join(sorted(found.__abstractmethods__))
+            raise InputError(f"{self.kind} {name!r} does not define {missing}")
+        if self.takes is not None:
+            check_call(f"{self.kind} {name!r}", found, self.takes)
         return found
 
 
@@ -133,6 +144,26 @@ def is_reference(name: str) -> bool:
     """Whether ``name`` has the form ``module:attribute``."""
     module, _, path = name.partition(":")
     return all(part.isidentifier() for part in (*module.split("."), *path.split(".")))
+
+
+def check_call(
+    kind: str, make: Callable[..., Any], takes: tuple[str, ...], options: Collection[str] = ()
+) -> None:
+    """Refuse what cannot be called with arguments ``takes`` and the named ``options``.
+
+    Raises:
+        InputError: naming the thing and what it is called with.
+    """
+    try:
+        signature = inspect.signature(make)
+    except (TypeError, ValueError):  # a part of the interpreter, which does not say
+        return
+    try:
+        signature.bind(*takes, **dict.fromkeys(options))
+    except TypeError as error:
+        name = getattr(make, "__name__", type(make).__name__)
+        call = f"{name}({', '.join((*takes, *options))})"
+        raise InputError(f"{kind} must be callable as {call}: {error}") from None
 
 
 def check_options(

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from ms_slam_env._runtime.extension import ExtensionPoint
+from ms_slam_env._runtime.extension import ExtensionPoint, check_call
 from ms_slam_env.camera import Intrinsics, pinhole
 from ms_slam_env.config import (
     Checked,
@@ -125,7 +126,7 @@ class EnvConfig(Checked):
         targets: motion-and-structure parameters and thresholds.
         reward: weights of the reward terms, or ``paper`` for the paper's. Or a function, or its
             name ``module:function``, of a step's ``Outcome`` that returns a number, or terms by
-            name whose sum is the reward.
+            name whose sum is the reward; a class of such functions is made without arguments.
     """
 
     scene: SceneName | tuple[SceneName, ...] = "living_room"
@@ -226,7 +227,7 @@ class EnvConfig(Checked):
 
 
 REWARDS = ExtensionPoint("reward", "ms_slam_env.rewards", form="module:function")
-"""Lookup of reward functions of a step's ``Outcome``."""
+"""Lookup of reward functions of a step's ``Outcome``, and of classes whose objects are such."""
 
 
 def _reward(given: object) -> RewardConfig | Callable[..., Any]:
@@ -247,8 +248,30 @@ def _reward(given: object) -> RewardConfig | Callable[..., Any]:
         )
     if isinstance(given, str) and ":" not in given and given not in REWARDS.names():
         raise REWARDS.unknown(given, presets)
-    found: Callable[..., Any] = REWARDS.find(given)
-    return found
+    found: Any = REWARDS.find(given)
+    if isinstance(found, type):
+        return _reward_of_class(found, given)
+    check_call(f"reward {given!r}", found, ("outcome",))
+    return cast("Callable[..., Any]", found)
+
+
+def _reward_of_class(cls: type, given: object) -> RewardConfig | Callable[..., Any]:
+    """An object of a class, made without arguments."""
+    if not (issubclass(cls, RewardConfig) or "__call__" in dir(cls)):
+        raise InputError(
+            f"reward {given!r} is a class whose objects are not callable; give a function of an "
+            f"Outcome, or a class with __call__(self, outcome)"
+        )
+    try:
+        inspect.signature(cls).bind()
+    except (TypeError, ValueError):
+        raise InputError(
+            f"reward {given!r} is a class that takes arguments; give an object of it"
+        ) from None
+    made = cls()
+    if not isinstance(made, RewardConfig):
+        check_call(f"reward {given!r}", made, ("outcome",))
+    return cast("RewardConfig | Callable[..., Any]", made)
 
 
 def make_config(

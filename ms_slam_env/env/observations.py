@@ -19,6 +19,7 @@ from ms_slam_env.env.robot_knowledge import (
     RobotKnowledge,
     state_vector,
 )
+from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
 from ms_slam_env.planning import (
     OccupancyGrid,
@@ -314,6 +315,8 @@ def make_observation(
 ) -> Observation:
     """Build variant ``name``, with the current SLAM configuration if there are several."""
     observation: Observation = POINT.find(name)(intrinsics, num_motions)
+    if not isinstance(getattr(observation, "space", None), spaces.Space):
+        raise InputError(f"observation {name!r} has no space; its constructor must set one")
     if num_configurations == 1:
         return observation
     return WithConfiguration(observation, num_configurations)

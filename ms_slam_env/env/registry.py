@@ -46,5 +46,11 @@ OBSERVATIONS = {
 }
 """Class path of each name of the option ``observation``."""
 
-POINT = ExtensionPoint("observation", "ms_slam_env.observations", Observation, own=OBSERVATIONS)
+POINT = ExtensionPoint(
+    "observation",
+    "ms_slam_env.observations",
+    Observation,
+    own=OBSERVATIONS,
+    takes=("intrinsics", "num_motions"),
+)
 """Lookup of observations; each is built from the intrinsics and the number of motions."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.config import Checked, Named, bounded
+from ms_slam_env.errors import InputError
 
 _DISTANCE_CAP = 0.4  # in units of M: one violent frame must not outweigh a whole episode
 _ERROR_CAP_M = 0.1  # a lost camera's error is arbitrary; the terms for lost tracking penalize it
@@ -131,7 +132,13 @@ def reward_terms(
     if not isinstance(weights, RewardConfig):
         value = weights(outcome)
         terms = value if isinstance(value, Mapping) else {"reward": value}
-        return _without_minus_zero({name: float(term) for name, term in terms.items()})
+        try:
+            return _without_minus_zero({name: float(term) for name, term in terms.items()})
+        except (TypeError, ValueError):
+            raise InputError(
+                f"reward {weights!r} returned {value!r}; it must return a number, or a mapping of "
+                "names to numbers"
+            ) from None
     intensity, depth = np.minimum(targets.distances(outcome.divergence), _DISTANCE_CAP)
     growth = float(np.clip(outcome.pose_error_growth_m, -_ERROR_CAP_M, _ERROR_CAP_M))
     terms = {

@@ -80,7 +80,7 @@ _SCALES = {
 }
 
 
-POINT = ExtensionPoint("metrics", "ms_slam_env.metrics", form="module:function")
+POINT = ExtensionPoint("metrics", "ms_slam_env.metrics", form="module:function", takes=())
 """Where more entries are found: functions that return a mapping like that of the file."""
 
 EXTRA_METRICS = "MS_SLAM_METRICS"

@@ -31,7 +31,11 @@ _LARGE = {
 _MESH_FILE = "ms_slam_env.scenes.mesh_file:from_file"  # where the name is that of a file
 
 POINT = ExtensionPoint(
-    "scene", "ms_slam_env.scenes", own={**_ROOMS, **_HOMES, **_LARGE}, form="module:function"
+    "scene",
+    "ms_slam_env.scenes",
+    own={**_ROOMS, **_HOMES, **_LARGE},
+    form="module:function",
+    takes=("seed",),
 )
 
 ROOMS: tuple[str, ...] = tuple(_ROOMS)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-from ms_slam_env._runtime.extension import ExtensionPoint, check_options
+from ms_slam_env._runtime.extension import ExtensionPoint, check_call, check_options
 from ms_slam_env.camera import Intrinsics, check_camera
 from ms_slam_env.config import from_dict, is_options
 from ms_slam_env.errors import InputError, unknown
@@ -95,6 +95,7 @@ def check_parameters(name: object, params: object) -> Any:
     options = dict(params)
     if not isinstance(entry, BackendEntry):
         check_options(f"SLAM backend {name}", entry, options, ("intrinsics",))
+        check_call(f"SLAM backend {name}", entry, ("intrinsics",), options)
         return options
     if entry.has_devices:
         _check_device(options.pop("device", "cpu"))
