@@ -222,8 +222,14 @@ class EnvConfig(Checked):
         return name, seed if given.get("scene_seed") is None else int(given["scene_seed"])
 
     def of_state(self, embodiment: str) -> dict[str, Any]:
-        """Settings that two environments must share to resume from the same state."""
-        return {"embodiment": embodiment, **{name: getattr(self, name) for name in _OF_STATE}}
+        """Settings that two environments must share to resume from the same state.
+
+        The observation and the mask as text: they may differ unless one of them needs an occupancy
+        grid, of which a state of another environment has none.
+        """
+        observation = str(getattr(self.observation, "__name__", self.observation))
+        shared = {name: getattr(self, name) for name in _OF_STATE}
+        return {"embodiment": embodiment, **shared, "observation": observation, "mask": self.mask}
 
 
 REWARDS = ExtensionPoint("reward", "ms_slam_env.rewards", form="module:function")

@@ -9,7 +9,12 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env.env.simulation import Simulation, World
-from ms_slam_env.env.state import check_episode, check_parts, check_same_settings
+from ms_slam_env.env.state import (
+    check_episode,
+    check_parts,
+    check_same_grid,
+    check_same_settings,
+)
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.shared.state_check import check_like, is_open
 
@@ -44,6 +49,7 @@ def load_state(
     """
     check_parts(state)
     check_same_settings(state["settings"], settings)
+    check_same_grid(state["settings"], settings, state["episode"], simulation.carves)
     motions, shape = simulation.embodiment_type.num_motions, simulation.intrinsics.shape
     own, blank = simulation.episode, simulation.blank
     check_episode(state["episode"], own, blank, shape, motions, simulation.carves)

@@ -41,6 +41,9 @@ PARTS = (
 )
 """Keys of a saved state of an environment."""
 
+_MAY_DIFFER = ("observation", "mask")
+"""Settings that are compared where the two disagree on keeping an occupancy grid."""
+
 _STEPS = WholeNumber(most="steps")
 _OF_EPISODE = {
     "scene": "",
@@ -91,10 +94,38 @@ def check_same_settings(saved: Any, own: Mapping[str, Any]) -> None:
     check_mapping(saved, "settings")
     check_keys(saved, list(own), "settings")
     for name, value in own.items():
-        if type(saved[name]) is not type(value) or not _is_equal(saved[name], value):
+        is_same = type(saved[name]) is type(value)
+        if not is_same or not (name in _MAY_DIFFER or _is_equal(saved[name], value)):
             raise InputError(
                 f"the state was saved with {name} = {saved[name]!r}, this environment has {value!r}"
             )
+
+
+def check_same_grid(
+    saved: Mapping[str, Any], own: Mapping[str, Any], episode: Any, carves: bool
+) -> None:
+    """Refuse a state whose observation and mask need an occupancy grid where one's own do not.
+
+    Args:
+        saved: settings of the state, as `check_same_settings` takes them.
+        own: settings of the environment.
+        episode: of the state.
+        carves: whether the environment keeps an occupancy grid.
+
+    Raises:
+        InputError: naming observation and mask of both, or the other way about.
+    """
+    differ = [name for name in _MAY_DIFFER if saved[name] != own[name]]
+    if not differ or (getattr(episode, "occupancy", None) is not None) == carves:
+        return
+    theirs, ours = (
+        " and ".join(f"{name} = {settings[name]!r}" for name in differ) for settings in (saved, own)
+    )
+    which = "needs an occupancy grid, which the state lacks" if carves else "keeps no such grid"
+    with_grid = "" if carves else ", which keeps an occupancy grid"
+    raise InputError(
+        f"the state was saved with {theirs}{with_grid}; this environment has {ours}, which {which}"
+    )
 
 
 def _is_equal(saved: Any, own: Any) -> bool:

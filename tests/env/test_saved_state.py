@@ -184,6 +184,22 @@ def test_an_environment_goes_on_to_the_bit_in_itself_in_a_fresh_one_and_in_a_cop
         ({"slam": "odometry"}, {}, r"saved with slam = 'odometry'.*has 'surfel'"),
         ({"frame_management": BUDGET}, {"frame_management": "regular"}, "frame_management"),
         ({"perturbed": "auto-exposure"}, {}, "perturbations"),
+        (
+            {"observation": "rgbd"},
+            {"observation": "goals"},
+            r"saved with observation = 'rgbd'; .* has observation = 'goals', which needs an occ",
+        ),
+        (
+            {"observation": "map"},
+            {"observation": "lookahead"},
+            r"saved with observation = 'map', which keeps an occupancy grid; this environment has "
+            r"observation = 'lookahead', which keeps no such grid",
+        ),
+        (
+            {},
+            {"mask": "map"},
+            r"saved with mask = 'true'; this environment has mask = 'map', which needs an occupan",
+        ),
     ],
 )
 def test_a_state_of_another_environment_is_refused_and_changes_nothing(saver, loader, message):
@@ -195,6 +211,14 @@ def test_a_state_of_another_environment_is_refused_and_changes_nothing(saver, lo
     with pytest.raises(InputError, match=message):
         other.load_state(after_steps(one, 1).save_state())
     assert same(other.save_state(), before)
+
+
+def test_a_state_of_another_observation_goes_on_where_both_keep_the_same():
+    one, other = (
+        gym.make(FREE, **OPTIONS, observation=name).unwrapped for name in ("rgbd", "pixels")
+    )
+    other.load_state(after_steps(one, 1).save_state())
+    assert one.step(0)[1] == other.step(0)[1]
 
 
 @pytest.fixture(scope="module", params=ms_slam_env.ENV_IDS)
