@@ -249,27 +249,47 @@ _TRAINING = ExtensionPoint(
 
 
 def sb3(argv: Sequence[str] | None = None) -> int:
-    """``ms-slam train sb3``; return the exit code: 0, 1 if nothing was learnt, 2, 130, 143."""
+    """Masked PPO of Stable-Baselines3, without memory; the default.
+
+    Returns:
+        the exit code: 0, 1 if nothing was learnt, 2, 130 or 143.
+    """
     return _run("sb3", Sb3Args, argv, "ms-slam train")
 
 
 def imitation(argv: Sequence[str] | None = None) -> int:
-    """``ms-slam train imitation``; return the exit code: 0, 1 if an episode failed, 2, 130."""
+    """Imitation of a planner (DAgger), with memory or without.
+
+    Returns:
+        the exit code: 0, 1 if an episode failed, 2, 130 or 143.
+    """
     return _run("imitation", ImitationArgs, argv)
 
 
 def ppo(argv: Sequence[str] | None = None) -> int:
-    """``ms-slam train ppo``; return the exit code: 0, 1, 2, 130 or 143."""
+    """Masked PPO of the package, with memory or without; can stay close to a policy.
+
+    Returns:
+        the exit code: 0, 1, 2, 130 or 143.
+    """
     return _run("ppo", PpoArgs, argv)
 
 
 def qrdqn(argv: Sequence[str] | None = None) -> int:
-    """``ms-slam train qrdqn``; return the exit code: 0, 1, 2, 130 or 143."""
+    """Masked QR-DQN, off-policy, with n-step returns.
+
+    Returns:
+        the exit code: 0, 1, 2, 130 or 143.
+    """
     return _run("qrdqn", QrdqnArgs, argv)
 
 
 def rllib(argv: Sequence[str] | None = None) -> int:
-    """``ms-slam train rllib [scaling]``; return the exit code: 0, 1, 2, 130 or 143."""
+    """Masked PPO of RLlib on a Ray cluster; "rllib scaling" measures its speed.
+
+    Returns:
+        the exit code: 0, 1, 2, 130 or 143.
+    """
     words = list(sys.argv[1:] if argv is None else argv)
     if words[:1] != ["scaling"]:
         return _run("rllib", RllibArgs, words)

@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 
 from ms_slam_env._runtime.command_line import exit_code
+from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env._runtime.progress import Bar
 from ms_slam_env.benchmark import rows as harness_rows
 from ms_slam_env.benchmark.planners import DETAILS, HEADLINE
 from ms_slam_env.cli import COMMANDS, main
+from ms_slam_env.cli.train import TRAINERS
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.records import Row
 from ms_slam_env.sequences import associate
@@ -52,6 +54,26 @@ def test_help_of_commands(command: str, capsys: pytest.CaptureFixture[str]) -> N
         main([command, "--help"])
     assert stop.value.code == 0
     assert "--out" in capsys.readouterr().out
+
+
+def test_the_help_of_training_lists_every_trainer(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One line each, also of a trainer of somebody else's that cannot be loaded."""
+    names, found = (*TRAINERS.names(), "other"), ExtensionPoint.names
+    monkeypatch.setattr(
+        ExtensionPoint, "names", lambda point: names if point is TRAINERS else found(point)
+    )
+    with pytest.raises(SystemExit) as stop:
+        main(["train", "--help"])
+    assert stop.value.code == 0
+    lines = capsys.readouterr().out.splitlines()
+    listed = dict(line.split(maxsplit=1) for line in lines[2 : 2 + len(names)])
+    assert {"sb3", "imitation", "ppo", "qrdqn", "rllib"} <= set(listed) == set(names)
+    assert listed["qrdqn"] == "Masked QR-DQN, off-policy, with n-step returns."
+    assert listed["other"].startswith("(unknown trainer 'other'")
+    assert all(len(text) > 20 for text in listed.values())
+    assert any("--total-timesteps" in line for line in lines)  # those of the default follow
 
 
 def test_no_command_is_code_2(capsys: pytest.CaptureFixture[str]) -> None:
