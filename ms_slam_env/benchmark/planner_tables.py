@@ -90,9 +90,12 @@ def across_scenes(rows: Sequence[Row], title: str = "") -> list[Table]:
 
 
 COMPARED = {
-    RANKED_BY: ("Better than each other", "better F-score"),
-    "f_score_5cm_area": ("Sooner than each other", "larger area under F-score over steps"),
-    "return": ("Better rewarded than each other", "larger return"),
+    RANKED_BY: ("Share of pairs, by final F-score", "better F-score"),
+    "f_score_5cm_area": (
+        "Share of pairs, by area under the F-score",
+        "larger area under F-score over steps",
+    ),
+    "return": ("Share of pairs, by return", "larger return"),
 }
 """Metrics by which planners are compared pairwise: title of the table, wording of its note."""
 
@@ -188,7 +191,7 @@ def from_the_same_start(rows: Sequence[Row], prefix: str = "") -> list[Table]:
         f"Share of {count} starts from which a line's planner has the larger area under "
         "F-score over steps than a column's, with 95 % Wilson intervals."
     )
-    title = f"{prefix}Sooner from the same start"
+    title = f"{prefix}Share of starts, by area under the F-score"
     return [make_table(["planner", *columns], lines, title, note)]
 
 

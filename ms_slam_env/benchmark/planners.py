@@ -46,6 +46,8 @@ PLANNERS = (
 )
 """Planners that need no extra."""
 EPISODES, LEADERBOARD_EPISODES = 10, 25
+POOLED = "Policies of each training pooled"
+"""Title of the tables that judge trainings in place of their policies."""
 _PANELS = ("f_score_5cm_area", "f_score_5cm", "ate_m", "path_length_m")
 _FLOOR_M = 5e-5  # smaller errors are drawn here on logarithmic axes
 
@@ -178,7 +180,7 @@ def _tables(rows: Sequence[Row], task: str) -> list[Table]:
     for metric in COMPARED:
         tables += better_than_each_other(rows, prefix, metric)
     tables += from_the_same_start(rows, prefix)
-    tables += _policies_as_one(rows, pairs, f"{prefix}Policies as one")
+    tables += _policies_as_one(rows, pairs, f"{prefix}{POOLED}")
     scenes = list(dict.fromkeys(row["spec"]["scene"] for row in rows))
     if len(scenes) > 1:
         for scene in scenes:

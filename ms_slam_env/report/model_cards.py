@@ -32,9 +32,9 @@ _SCORES = (
 )
 _ACROSS = "over all scenes"
 _VERDICTS = (
-    ("Better than each other", "f_score_5cm", "F-score"),
-    ("Sooner than each other", "f_score_5cm_area", "area under F-score"),
-    ("Better rewarded than each other", "return", "return"),
+    ("Share of pairs, by final F-score", "f_score_5cm", "F-score"),
+    ("Share of pairs, by area under the F-score", "f_score_5cm_area", "area under F-score"),
+    ("Share of pairs, by return", "return", "return"),
 )
 """A table of probabilities, by what the best classical planner is chosen, and what it is."""
 _NO_RIVALS = (
@@ -327,7 +327,7 @@ def _limits(
             version = one.results.version
             yield f"- Its training curve is of results version {version}, older than the code."
         if one.results.uncommitted:
-            yield "- It was trained from an uncommitted state of the code."
+            yield "- It was trained with code that is in no commit."
     yield ""
 
 

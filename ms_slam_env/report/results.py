@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import lzma
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -89,9 +89,9 @@ class Results:
         """A sentence where files differed from the commit that is named, else empty."""
         rows = [str(row.get("commit")).endswith(DIRTY) for row in self.rows]
         if any(rows):
-            return f"Made from an uncommitted state of the code: {sum(rows)} of {len(rows)} rows."
+            return f"{sum(rows)} of {len(rows)} rows were made with code that is in no commit."
         is_dirty = str(self.provenance.get("commit")).endswith(DIRTY)
-        return "Made from an uncommitted state of the code." if is_dirty else ""
+        return "Made with code that is in no commit." if is_dirty else ""
 
     @property
     def caveats(self) -> str:
@@ -221,7 +221,7 @@ def read_results(path: Path) -> Results:
             kind=str(content.pop("kind")),
             title=str(content.pop("title", "")),
             about=str(content.pop("about", "")),
-            tables=[table_from_json(table) for table in content.pop("tables")],
+            tables=[_retitled(table_from_json(table)) for table in content.pop("tables")],
             charts=[chart_from_json(chart) for chart in content.pop("charts", [])],
             rows=_checked_rows(content.pop(rows_key, [])),
             rows_key=rows_key,
@@ -233,6 +233,22 @@ def read_results(path: Path) -> Results:
         if isinstance(error, InputError):
             raise InputError(f"{path}: {error}") from None
         raise InputError(f"{path} is not a result of ms-slam: {error!r}") from None
+
+
+_RETITLED = {
+    "Better than each other": "Share of pairs, by final F-score",
+    "Sooner than each other": "Share of pairs, by area under the F-score",
+    "Better rewarded than each other": "Share of pairs, by return",
+    "Sooner from the same start": "Share of starts, by area under the F-score",
+    "Policies as one": "Policies of each training pooled",
+}
+"""Titles of the planner benchmark's tables in older results, and what they are called now."""
+
+
+def _retitled(table: Table) -> Table:
+    """A table of an older result by its title of today, behind a task's name or another title."""
+    parts = [_RETITLED.get(part, part) for part in table.title.split(": ")]
+    return replace(table, title=": ".join(parts))
 
 
 def _unpacked(path: Path) -> Any:

@@ -133,8 +133,8 @@ def test_losses_count_together_and_energy_only_where_something_was_moved() -> No
 
 def test_every_planner_is_compared_with_every_other() -> None:
     tables = {table.title: table for table in CONFIG.tables(rows_of(CONFIG))}
-    assert tables["Sooner than each other"].rows
-    table = tables["Better than each other"]
+    assert tables["Share of pairs, by area under the F-score"].rows
+    table = tables["Share of pairs, by final F-score"]
     lines: Any = table.rows
     assert [line["planner"] for line in lines] == ["greedy", "random"]
     assert (lines[0]["greedy"], lines[0]["random"].value) == (None, 1.0)
@@ -165,7 +165,9 @@ def test_from_the_same_start_pairs_are_compared_one_by_one() -> None:
     assert "3 starts" in fewer.note
     del rows[0]["result"]["f_score_5cm_area"]
     assert "3 starts" in from_the_same_start(rows)[0].note
-    assert "Sooner from the same start" in [t.title for t in CONFIG.tables(rows_of(CONFIG))]
+    assert "Share of starts, by area under the F-score" in [
+        t.title for t in CONFIG.tables(rows_of(CONFIG))
+    ]
 
 
 def test_policies_of_one_training_are_judged_together_too() -> None:
@@ -176,14 +178,16 @@ def test_policies_of_one_training_are_judged_together_too() -> None:
         for name, score in scores.items()
     ]
     tables = {table.title: table for table in CONFIG.tables(rows)}
-    lines: Any = tables["Policies as one: Better than each other"].rows
+    lines: Any = tables["Policies of each training pooled: Share of pairs, by final F-score"].rows
     found = {line["planner"]: line for line in lines}
     assert set(found) == {"nbv", "agent (3 policies)", "x,path=c"}
     of_trainings = found["agent (3 policies)"]["nbv"]
     assert of_trainings.value == pytest.approx(2 / 3)
     assert (of_trainings.low, of_trainings.high) == pytest.approx((0, 1))  # by one policy and all
-    assert len(tables["Better than each other"].rows) == 5
-    medians: Any = {line["planner"]: line for line in tables["Policies as one"].rows}
+    assert len(tables["Share of pairs, by final F-score"].rows) == 5
+    medians: Any = {
+        line["planner"]: line for line in tables["Policies of each training pooled"].rows
+    }
     assert medians["agent (3 policies)"]["episodes"] == 3 * medians["nbv"]["episodes"]
     assert medians["agent (3 policies)"]["f_score_5cm"].value == pytest.approx(0.7)
     over_steps = CONFIG.charts(rows)[0].panels[0]
@@ -224,12 +228,12 @@ def test_a_policy_that_finished_nothing_is_none_of_its_training() -> None:
         for seed in range(3)
     ]
     tables = {table.title: table for table in CONFIG.tables(rows)}
-    (line,) = tables["Policies as one"].rows
+    (line,) = tables["Policies of each training pooled"].rows
     assert line["planner"] == "p (2 policies)"
     for row in rows:
         if row["spec"]["planner"] == "p,path=a/1":
             row["result"], row["error"] = None, "x"
-    assert not [title for title in (t.title for t in CONFIG.tables(rows)) if "as one" in title]
+    assert not [title for title in (t.title for t in CONFIG.tables(rows)) if "pooled" in title]
 
 
 def test_planners_are_compared_by_what_the_reward_says_too() -> None:
@@ -237,7 +241,7 @@ def test_planners_are_compared_by_what_the_reward_says_too() -> None:
     for row in rows:
         row["result"]["return"] = -row["result"]["f_score_5cm"]
     tables = {table.title: table for table in CONFIG.tables(rows)}
-    lines: Any = tables["Better rewarded than each other"].rows
+    lines: Any = tables["Share of pairs, by return"].rows
     assert [line["planner"] for line in lines] == ["random", "greedy"]
     assert lines[0]["greedy"].value == 1.0
 

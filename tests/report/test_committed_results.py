@@ -22,6 +22,9 @@ def test_a_result_can_be_read(path: Path) -> None:
     for row in results.rows:
         check_keys(row.get("result") or {})
     assert results.tables
+    assert not [
+        t.title for t in results.tables if re.search("as one|each other|[Ss]ooner", t.title)
+    ]
     assert results.provenance.get("command"), "which command made it?"
     if results.stale:  # as it says above its tables
         print(f"{path.relative_to(FOLDER)}: {results.stale}")

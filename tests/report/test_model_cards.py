@@ -48,14 +48,14 @@ def scores(
             task + title,
         )
         for title, other, value in (
-            ("Better than each other", "nbv", chance),
-            ("Sooner than each other", "random", Interval(0.7, 0.55, 0.8)),
+            ("Share of pairs, by final F-score", "nbv", chance),
+            ("Share of pairs, by area under the F-score", "random", Interval(0.7, 0.55, 0.8)),
         )
     )
     rewarded = make_table(
         ["planner", *(Column(name, "improvement", name) for name in ("random", "nbv"))],
         [{"planner": "random"}, {"planner": planner, "random": by_return}, {"planner": "nbv"}],
-        "Better rewarded than each other",
+        "Share of pairs, by return",
     )
     rows = [
         {"spec": {"planner": name, "scene": scene}, "result": {}, "error": None}

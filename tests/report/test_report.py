@@ -191,7 +191,7 @@ def test_only_what_a_version_changed_is_older_than_it(tmp_path: Path) -> None:
 def test_what_an_uncommitted_state_made_says_so(tmp_path: Path) -> None:
     path = write_example(tmp_path / "results.json")
     content = json.loads(path.read_text())
-    said = "Made from an uncommitted state of the code"
+    said = "Made with code that is in no commit"
     content["provenance"]["commit"] = "0123abcd"
     path.write_text(json.dumps(content))
     assert said not in read_results(path).as_markdown()
@@ -200,8 +200,31 @@ def test_what_an_uncommitted_state_made_says_so(tmp_path: Path) -> None:
     assert f"*{said}.*" in read_results(path).as_markdown()
     content[content["rows_key"]][0]["commit"] = "0123abcd-dirty"
     path.write_text(json.dumps(content))
-    assert f"{said}: 1 of " in read_results(path).as_markdown()
-    assert f"{said}: 1 of " in report_of(tmp_path)
+    of_rows = f"1 of {len(content[content['rows_key']])} rows were m{said[1:]}"
+    assert f"*{of_rows}.*" in read_results(path).as_markdown()
+    assert of_rows in report_of(tmp_path)
+    glossary = (Path(__file__).parents[2] / "docs" / "glossary.md").read_text()
+    assert f"### {said[10:].capitalize()}" in glossary
+
+
+def test_tables_of_older_results_have_the_titles_of_today(tmp_path: Path) -> None:
+    path = write_example(tmp_path / "results.json")
+    content = json.loads(path.read_text())
+    old = (
+        "home: Sooner than each other",
+        "Policies as one",
+        "Policies as one: Better than each other",
+    )
+    table = content["tables"][0]
+    content["tables"] = [{**table, "title": title} for title in (*old, "Details")]
+    path.write_text(json.dumps(content))
+    pooled = "Policies of each training pooled"
+    assert [table.title for table in read_results(path).tables] == [
+        "home: Share of pairs, by area under the F-score",
+        pooled,
+        f"{pooled}: Share of pairs, by final F-score",
+        "Details",
+    ]
 
 
 @pytest.mark.parametrize("kind", sorted(set(chain(*CHANGED_KINDS.values())) - {"train"}))
