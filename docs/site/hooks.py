@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -119,12 +120,14 @@ def _api() -> Iterator[tuple[str, str]]:
 
 def _results() -> Iterator[tuple[str, str]]:
     """A page for each folder of committed results, and one that lists them."""
+    from ms_slam_env.benchmark.planner_tables import with_privilege
     from ms_slam_env.metrics.registry import RESULTS_VERSION
     from ms_slam_env.report.discovery import find_results
 
     rows, pages = [], []
     for found in find_results(RESULTS)[0]:
         folder, result = found.path.parent, found.results
+        result = replace(result, tables=[with_privilege(table) for table in result.tables])
         name = folder.name
         figures = "".join(f"![{p.stem}]({p.name})\n\n" for p in sorted(folder.glob("*.png")))
         page = f"# {result.title}\n\n{result.about}\n\n{result.as_markdown()}\n\n{figures}"

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.benchmark.episodes import short_planner_names
+from ms_slam_env.env.planners import is_privileged
 from ms_slam_env.report import statistics
+from ms_slam_env.report.leaders import PAIRS, PRIVILEGED
 from ms_slam_env.report.tables import (
     Column,
     Row,
@@ -53,6 +55,20 @@ def with_losses(table: Table, rows: Sequence[Row]) -> Table:
     return replace(table, columns=tuple(columns), rows=tuple(lines))
 
 
+def with_privilege(table: Table) -> Table:
+    """Say of each planner whether it sees the truth, where one of a table's planners does."""
+    names = [column.name for column in table.columns]
+    if "planner" not in names or PRIVILEGED in names:
+        return table
+    known = [is_privileged(str(line.get("planner"))) for line in table.rows]
+    if not any(known):
+        return table
+    after = names.index("planner") + 1
+    columns = (*table.columns[:after], Column(PRIVILEGED), *table.columns[after:])
+    lines = [{**line, PRIVILEGED: of} for line, of in zip(table.rows, known, strict=True)]
+    return replace(table, columns=columns, rows=tuple(lines))
+
+
 def score_matrices(rows: Sequence[Row], metric: str = RANKED_BY) -> dict[str, NDArray[np.float64]]:
     """Return the scores (episodes, scenes) of each planner with an episode in every scene.
 
@@ -90,14 +106,11 @@ def across_scenes(rows: Sequence[Row], title: str = "") -> list[Table]:
 
 
 COMPARED = {
-    RANKED_BY: ("Share of pairs, by final F-score", "better F-score"),
-    "f_score_5cm_area": (
-        "Share of pairs, by area under the F-score",
-        "larger area under F-score over steps",
-    ),
-    "return": ("Share of pairs, by return", "larger return"),
+    RANKED_BY: "better F-score",
+    "f_score_5cm_area": "larger area under F-score over steps",
+    "return": "larger return",
 }
-"""Metrics by which planners are compared pairwise: title of the table, wording of its note."""
+"""Metrics by which planners are compared pairwise, and the wording of the tables' notes."""
 
 
 def better_than_each_other(
@@ -107,7 +120,7 @@ def better_than_each_other(
 
     Empty for a single planner.
     """
-    title, what = COMPARED[metric]
+    title, what = PAIRS[metric], COMPARED[metric]
     scores = score_matrices(rows, metric)
     if len(scores) < 2:
         return []
@@ -123,7 +136,7 @@ def trainings_compared(
 
     Empty for a single training or planner.
     """
-    title, what = COMPARED[metric]
+    title, what = PAIRS[metric], COMPARED[metric]
     name_of = _names_of_trainings(rows)
     members: dict[str, list[NDArray[np.float64]]] = {}
     for planner, of in score_matrices(rows, metric).items():

@@ -21,6 +21,7 @@ from ms_slam_env._runtime.parallel import one_thread_unless_set, open_pool, run_
 from ms_slam_env._runtime.progress import Bar
 from ms_slam_env._runtime.result_folders import alone_in
 from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.benchmark.planner_tables import with_privilege
 from ms_slam_env.errors import InputError, one_line
 from ms_slam_env.evaluation.run_sequence import lost_throughout
 from ms_slam_env.metrics.registry import RESULTS_VERSION, versions_since
@@ -253,7 +254,7 @@ def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results
         kind=_kind(experiment),
         title=experiment.title(),
         about=experiment.about(),
-        tables=experiment.tables(rows),
+        tables=[with_privilege(table) for table in experiment.tables(rows)],
         charts=experiment.charts(rows),
         rows=rows,
         rows_key=experiment.rows_key,

@@ -21,7 +21,8 @@ class Arguments:
 
     A table stands between <!-- results: FOLDER table=0 columns=planner,ate_m --> and
     <!-- end -->; FOLDER is one of docs/results. Model cards stand between <!-- agents: FILE -->
-    and <!-- end -->; FILE is a policy, or a folder of them.
+    and <!-- end -->; FILE is a policy, or a folder of them. Which planner leads each of some
+    benchmarks stands between <!-- leaders: FOLDER ... by=f_score_5cm --> and <!-- end -->.
     """
 
     pages: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -38,6 +39,7 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Write the tables, or check them, and print the pages that were out of date."""
     args = parse(Arguments, arguments, "ms-slam docs")
+    from ms_slam_env.benchmark.planner_tables import with_privilege
     from ms_slam_env.report.markdown_pages import update_pages
     from ms_slam_env.report.results import pack_results
 
@@ -49,7 +51,7 @@ def main(arguments: Sequence[str]) -> int:
     if not pages:
         raise InputError(f"{args.root} holds no pages: no {_PAGES[0]} and no Markdown in docs")
     results = args.root / "docs" / "results"
-    changed = update_pages(pages, results, write=not args.check)
+    changed = update_pages(pages, results, not args.check, with_privilege)
     for page in changed:
         print(f"{page}: {'out of date' if args.check else 'written'}")
     if args.check and changed:

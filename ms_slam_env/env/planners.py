@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -251,6 +253,26 @@ def check_planner(text: str, **more: Any) -> None:
         InputError: an unknown planner or option.
     """
     _parsed(text, more)
+
+
+def is_privileged(text: str) -> bool | None:
+    """Whether the planner ``NAME,option=value,...`` sees the truth; None if it is not known.
+
+    The text may come from a record, so it imports nothing of its own: a class counts by the name of
+    an entry point of an installed package, or if its module is loaded already.
+    """
+    name = re.split(r",| \(", text, maxsplit=1)[0]
+    module, _, path = name.partition(":")
+    if path:
+        found: Any = sys.modules.get(module)
+        for part in path.split("."):
+            found = getattr(found, "__dict__", {}).get(part)
+    else:
+        try:
+            found = PLANNERS.find(name) if name in PLANNERS.names() else None
+        except InputError:  # its package lacks something
+            found = None
+    return issubclass(found, PrivilegedPlanner) if isinstance(found, type) else None
 
 
 def _parsed(text: str, more: Mapping[str, Any]) -> tuple[type[Planner], dict[str, Any]]:

@@ -14,7 +14,8 @@ Where the result is older than the code, or made from an uncommitted state of it
 tables on the page says so above.
 
 After ``agents:`` in place of ``results:`` stand policy files or folders of them, from the root of
-the clone on; what follows are their model cards.
+the clone on; what follows are their model cards. After ``leaders:`` stand folders of results of the
+planner benchmark and ``by=METRIC``; what follows says which planner leads each, and by how much.
 """
 
 from __future__ import annotations
@@ -23,28 +24,40 @@ import dataclasses
 import re
 import shlex
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ms_slam_env._runtime.input_files import read_text
 from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.report.leaders import leaders
 from ms_slam_env.report.model_cards import model_cards
 from ms_slam_env.report.results import RESULTS, Results, made_by, read_results
 from ms_slam_env.report.tables import Table
 
-_START = re.compile(r"^<!-- (?P<kind>results|agents): (?P<what>.*) -->$")
+_START = re.compile(r"^<!-- (?P<kind>results|agents|leaders): (?P<what>.*) -->$")
 _END = "<!-- end -->"
 _OPTIONS = ("table", "columns", "where", "rows", "made_by")
 
 
-def update_pages(pages: Iterable[Path], results: Path, write: bool = True) -> list[Path]:
+Mark = Callable[[Table], Table]
+"""Adds to a stored table what is known by now of its lines."""
+
+
+def _unmarked(table: Table) -> Table:
+    return table
+
+
+def update_pages(
+    pages: Iterable[Path], results: Path, write: bool = True, mark: Mark = _unmarked
+) -> list[Path]:
     """Write the tables of Markdown pages; return the pages that were out of date.
 
     Args:
         pages: Markdown files.
         results: folder of the folders of results.
         write: whether to change the pages.
+        mark: applied to the tables of results.
 
     Raises:
         InputError: a comment that names no table, or is not closed; the message says where.
@@ -52,7 +65,7 @@ def update_pages(pages: Iterable[Path], results: Path, write: bool = True) -> li
     changed = []
     for page in pages:
         before = read_text(page, "page")
-        after = with_tables(before, results, str(page))
+        after = with_tables(before, results, str(page), mark)
         if after != before:
             changed.append(page)
             if write:
@@ -60,8 +73,8 @@ def update_pages(pages: Iterable[Path], results: Path, write: bool = True) -> li
     return changed
 
 
-def with_tables(text: str, results: Path, name: str = "page") -> str:
-    """``text`` with its tables as the results have them.
+def with_tables(text: str, results: Path, name: str = "page", mark: Mark = _unmarked) -> str:
+    """``text`` with its tables as the results have them, each as ``mark`` returns it.
 
     Raises:
         InputError: see :func:`update_pages`.
@@ -80,8 +93,10 @@ def with_tables(text: str, results: Path, name: str = "page") -> str:
             try:
                 if start["kind"] == "agents":
                     inserted = _cards(start["what"], results, Path(name))
+                elif start["kind"] == "leaders":
+                    inserted = _leaders(start["what"], results, mark)
                 else:
-                    inserted = _inserted(start["what"], results, warned)
+                    inserted = _inserted(start["what"], results, warned, mark)
                 lines += [line, "", *inserted.split("\n"), ""]
             except InputError as error:
                 raise InputError(f"{name}, line {number}: {error}") from None
@@ -100,6 +115,16 @@ def _cards(what: str, results: Path, page: Path) -> str:
     return model_cards([root / word for word in _words(what)], results, page).rstrip("\n")
 
 
+def _leaders(what: str, folder: Path, mark: Mark) -> str:
+    """Who leads each of the results that a comment names, by the metric that it names."""
+    names = _words(what)
+    by = [name.removeprefix("by=") for name in names if name.startswith("by=")]
+    if len(by) != 1 or len(names) < 2:
+        raise InputError(f"{what!r}: must name folders of results and by=METRIC")
+    found = [read_results(folder / name / RESULTS) for name in names if "=" not in name]
+    return leaders(found, by[0], mark).as_markdown().rstrip("\n")
+
+
 def _words(what: str) -> list[str]:
     try:
         return shlex.split(what)
@@ -107,7 +132,7 @@ def _words(what: str) -> list[str]:
         raise InputError(f"{what!r}: {str(error).lower()}") from None
 
 
-def _inserted(what: str, folder: Path, warned: set[Path]) -> str:
+def _inserted(what: str, folder: Path, warned: set[Path], mark: Mark) -> str:
     """What stands below a comment: a warning where the result is out of date, note and table.
 
     Results in ``warned`` have their warning further up; this one's is added.
@@ -120,7 +145,7 @@ def _inserted(what: str, folder: Path, warned: set[Path]) -> str:
     path = folder / place
     path = path if path.suffix == ".json" else path / RESULTS
     results = read_results(path)
-    table = _cut(_chosen(results, options.get("table", "0")), options)
+    table = _cut(mark(_chosen(results, options.get("table", "0"))), options)
     parts = [f"*{results.caveats}*\n"] if results.caveats and path not in warned else []
     warned.add(path)
     parts.append(table.as_markdown())

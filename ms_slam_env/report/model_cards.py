@@ -17,6 +17,7 @@ from typing import Any
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.discovery import FoundResult, find_results
+from ms_slam_env.report.leaders import PAIRS
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import Table, format_value
 from ms_slam_env.scenes import SEED_SPLITS, seeds_of, split_of
@@ -32,9 +33,9 @@ _SCORES = (
 )
 _ACROSS = "over all scenes"
 _VERDICTS = (
-    ("Share of pairs, by final F-score", "f_score_5cm", "F-score"),
-    ("Share of pairs, by area under the F-score", "f_score_5cm_area", "area under F-score"),
-    ("Share of pairs, by return", "return", "return"),
+    (PAIRS["f_score_5cm"], "f_score_5cm", "F-score"),
+    (PAIRS["f_score_5cm_area"], "f_score_5cm_area", "area under F-score"),
+    (PAIRS["return"], "return", "return"),
 )
 """A table of probabilities, by what the best classical planner is chosen, and what it is."""
 _NO_RIVALS = (

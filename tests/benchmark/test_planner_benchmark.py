@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,11 @@ from ms_slam_env.benchmark.planner_tables import (
     from_the_same_start,
     policies_together,
     score_matrices,
+    with_privilege,
 )
 from ms_slam_env.benchmark.planners import PlannerBenchmark
 from ms_slam_env.benchmark.rows import write_all
+from ms_slam_env.env.planners import is_privileged
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.records import Row, spec_key
 from ms_slam_env.report.results import read_results
@@ -129,6 +132,35 @@ def test_losses_count_together_and_energy_only_where_something_was_moved() -> No
     assert lines["greedy"]["not_recovered_share"].value == 0
     rows[0]["result"]["energy_j"] = 1.0
     assert "energy_j" in [column.name for column in CONFIG.tables(rows)[0].columns]
+
+
+def test_planners_that_see_the_truth_are_marked(tmp_path: Path) -> None:
+    config = replace(CONFIG, planners=("random", "foresight,tried=4", "oracle"))
+    written = write_all(config, rows_of(config), tmp_path)
+    assert {table.title for table in written.tables if "privileged" in table.rows[0]} >= {
+        *("", "Details", "Across scenes", "table", "Share of pairs, by final F-score"),
+    }
+    table = read_results(tmp_path / "results.json").tables[0]
+    assert [column.name for column in table.columns[:2]] == ["planner", "privileged"]
+    assert {line["planner"]: line["privileged"] for line in table.rows} == {
+        "random": False,
+        "foresight,tried=4": True,
+        "oracle": True,
+    }
+    assert "| oracle | yes | 6 |" in table.as_markdown()
+    assert with_privilege(table) is table
+    (fair, *_) = write_all(CONFIG, rows_of(CONFIG), tmp_path).tables
+    assert "privileged" not in [column.name for column in fair.columns]
+
+
+def test_no_name_of_a_record_is_imported_to_mark_it() -> None:
+    """``antigravity`` opens a browser; a class that is loaded already is looked at."""
+    assert is_privileged("antigravity:fly") is None
+    assert "antigravity" not in sys.modules
+    assert is_privileged("no such planner") is None
+    assert is_privileged("agent-room (5 policies)") is is_privileged("nbv,path=x:y") is False
+    assert is_privileged("ms_slam_env.env.planners:PrivilegedPlanner,a=1") is True
+    assert is_privileged("ms_slam_env.env.planners:PLANNERS.find") is None
 
 
 def test_every_planner_is_compared_with_every_other() -> None:
