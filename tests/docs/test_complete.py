@@ -12,6 +12,7 @@ import pytest
 from ms_slam_env import scenes, slam, tasks
 from ms_slam_env.benchmark import EXPERIMENTS, experiment_class
 from ms_slam_env.cli import COMMANDS
+from ms_slam_env.cli.train import TRAINERS
 from ms_slam_env.env.registry import OBSERVATIONS
 from ms_slam_env.report.discovery import find_results
 from ms_slam_env.report.records import to_plain
@@ -23,6 +24,7 @@ _PYPROJECT = (ROOT / "pyproject.toml").read_text()
 _SECTION = re.search(r'entry-points\."ms_slam_env.planners"\]\n(.*?)\n\n', _PYPROJECT, re.DOTALL)
 assert _SECTION
 PLANNERS = re.findall(r"^([\w-]+) = ", _SECTION[1], re.MULTILINE)
+ALL_RECORDS = [one.path for one in find_results(ROOT / "docs" / "results")[0]]
 COMMITTED = [
     one.path
     for one in find_results(ROOT / "docs" / "results")[0]
@@ -44,6 +46,16 @@ COMMITTED = [
 def test_the_page_of_a_kind_names_everything_of_it(page: str, names: Iterable[str]) -> None:
     text = (ROOT / "docs" / f"{page}.md").read_text()
     assert [name for name in names if not re.search(rf"`{re.escape(name)}[`,]", text)] == []
+
+
+def test_the_page_on_training_says_which_trainers_no_record_compares() -> None:
+    commands = [str(read_results(path).provenance.get("command")) for path in ALL_RECORDS]
+    judged = {name for text in commands for name in re.findall(r"^ms-slam train (\w+) --", text)}
+    text = (ROOT / "docs" / "training.md").read_text()
+    (said,) = re.findall(r"judge policies of (.*?) alone: no record compares\s(.*?) with", text)
+    named, others = (set(re.findall(r"`(\w+)`", part)) for part in said)
+    assert judged == named  # "rllib scaling" counts steps a second
+    assert others == set(TRAINERS.names()) - named
 
 
 def test_every_command_has_a_file_and_every_file_a_command() -> None:
