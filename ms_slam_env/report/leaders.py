@@ -35,7 +35,7 @@ def leaders(
     """
     if by not in PAIRS:
         raise unknown("metric of planners", by, PAIRS)
-    columns = [
+    columns: list[Column | str] = [
         "task",
         Column("planner", heading="to beat"),
         by,
