@@ -1,6 +1,6 @@
-"""SLAM backends, by name; each is imported where it is made.
+"""SLAM backends by name; each is imported only when it is made.
 
-Loading kernels takes a while, and an extra may be missing.
+Loading kernels takes a while, and an optional dependency may be missing.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from ms_slam_env.slam.slam_backend import SlamBackend
 
 @dataclass(frozen=True)
 class BackendEntry:
-    """Where a backend is."""
+    """Where to import a backend from."""
 
     module: str  # its module below ``ms_slam_env.slam``
-    backend: str  # name of its class, made of intrinsics and configuration
-    config: str  # name of the dataclass of its parameters
-    has_devices: bool = False  # whether it takes a device as well
+    backend: str  # name of its class, constructed from intrinsics and configuration
+    config: str  # name of its parameter dataclass
+    has_devices: bool = False  # whether it also takes a device
 
     def load(self, name: str) -> Any:
-        """The class ``name`` of its module."""
+        """Import the class ``name`` from its module."""
         return getattr(import_module(f"ms_slam_env.slam.{self.module}"), name)
 
 
@@ -40,14 +40,14 @@ _OWN = {
 }
 
 BACKENDS: tuple[str, ...] = tuple(_OWN)
-"""Names of our backends."""
+"""Names of the built-in backends."""
 
 POINT = ExtensionPoint("SLAM backend", "ms_slam_env.slam", SlamBackend, own=_OWN)
-"""Where backends are found; a user's class is made of intrinsics and its options as keywords."""
+"""Finds backends; a user's class is constructed with intrinsics and its options as keywords."""
 
 
 def make_backend(name: object, intrinsics: Intrinsics, params: Mapping[str, Any]) -> SlamBackend:
-    """The backend ``name`` for a camera; see ``ms_slam_env.slam.make``.
+    """Make the backend ``name`` for a camera; see ``ms_slam_env.slam.make``.
 
     Raises:
         InputError: unknown backend, unknown parameter or value out of range.
@@ -64,10 +64,10 @@ def make_backend(name: object, intrinsics: Intrinsics, params: Mapping[str, Any]
 
 
 def backend_name(cls_name: object) -> str:
-    """Name of our backend whose class has this name.
+    """Name of the built-in backend with this class name.
 
     Raises:
-        InputError: none of ours has.
+        InputError: no built-in backend has it.
     """
     names = {entry.backend: name for name, entry in _OWN.items()}
     if not isinstance(cls_name, str) or cls_name not in names:
@@ -76,10 +76,10 @@ def backend_name(cls_name: object) -> str:
 
 
 def check_parameters(name: object, params: object) -> Any:
-    """Refuse what ``make_backend`` would refuse, without making a backend.
+    """Check a backend's options without making it; refuses whatever ``make_backend`` would.
 
     Returns:
-        the backend's parameters as its dataclass; of a user's class as they are.
+        the parameters as the backend's dataclass; for a user's class, ``params`` as a dictionary.
 
     Raises:
         InputError: unknown backend, unknown parameter or value out of range.
