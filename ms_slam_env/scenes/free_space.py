@@ -68,7 +68,7 @@ class FreeSpace:
 
         Args:
             points: (N, 3) samples of the surface, closer together than ``voxel_m``.
-            rule: which of the empty voxels are the free space.
+            rule: selects the free voxels among the empty ones.
             voxel_m: edge of a voxel; increased if the grid would not fit in memory.
         """
         low, high = points.min(0), points.max(0)

@@ -183,7 +183,7 @@ def table(seed: int) -> MeshScene:
 
 
 def clutter(build: MeshBuilder, rng: Rng, width: float, depth: float) -> None:
-    """Put things on the rectangle [-width/2, width/2] x [-depth, 0] at z = 0."""
+    """Place objects on the rectangle [-width/2, width/2] x [-depth, 0] at z = 0."""
     with build.frame((rng.uniform(-0.2, 0.2), -0.3 * depth, 0), yaw=rng.uniform(-0.25, 0.25)):
         small_things.laptop(build, rng, "laptop")
     makers: dict[str, tuple[Callable[..., None], float]] = {

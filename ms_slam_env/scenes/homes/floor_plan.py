@@ -270,7 +270,7 @@ class _SharedWall:
     low: Float64
     high: Float64
     along_x: bool  # the way through it
-    is_swapped: bool  # the first room lies on the high side
+    is_swapped: bool  # the first room is on the high side
 
     @property
     def length(self) -> float:

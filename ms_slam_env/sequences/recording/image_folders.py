@@ -54,7 +54,7 @@ def images(folder: Path) -> list[Path]:
     """List a folder's images, ordered by the numbers in their names.
 
     Raises:
-        InputError: no folder, or no image in it.
+        InputError: not a folder, or without images.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of images")

@@ -113,7 +113,7 @@ class SwitchingConfig(AdaptationConfig):
 
     @property
     def first(self) -> int:
-        """Index of the first configuration in force."""
+        """Index of the configuration to start with."""
         return self.num_configurations - 1 if self.start is None else self.start
 
     def resolved(self, intrinsics: Intrinsics) -> tuple[SlamConfiguration, ...]:

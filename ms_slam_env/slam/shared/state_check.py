@@ -179,7 +179,7 @@ def _check(value: Any, like: Any, where: str, lengths: _Lengths) -> None:
         check_plain(value, 0, where, low=like.least)
         lengths.later.append(lambda: _check_between(value, like.least, lengths.most(like), where))
     elif isinstance(like, numbers.Integral) and not isinstance(like, bool):
-        least = min(0, int(like))  # where there may be none, -1 says so
+        least = min(0, int(like))  # -1 in the template allows -1 for none
         _check(value, WholeNumber(least), where, lengths)
     elif isinstance(like, Real):
         if not isinstance(value, (float, np.floating)) or not like.least <= value <= like.most:
@@ -408,7 +408,7 @@ def check_plain(value: Any, like: Any, where: str, low: int | None = None) -> No
     if not isinstance(value, kind) or (kind is not _KINDS[0] and isinstance(value, _KINDS[0])):
         raise wrong(where, f"is a {type(value).__name__}, not a {type(like).__name__}")
     if kind is numbers.Integral:
-        low = min(0, like) if low is None else low  # where there may be none, -1 says so
+        low = min(0, like) if low is None else low  # -1 in the template allows -1 for none
         if not low <= value <= _MOST_SEED:
             raise wrong(where, f"is {value}, outside [{low}, {_MOST_SEED}]")
     if kind is _KINDS[2] and not np.isfinite(value):

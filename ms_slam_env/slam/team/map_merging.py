@@ -71,7 +71,7 @@ class Merge:
     found: int = 0  # number of hypotheses
     agreeing: int = 0  # largest number of them that agree
     fit: Fit = field(default_factory=Fit)  # of the maps; NaN if no pose was verified
-    # by how much registration moved b's cameras, metres; 0 if it was not accepted.
+    # distance that registration moved b's cameras, metres; 0 if it was not accepted.
     refined_m: float = 0.0
 
 

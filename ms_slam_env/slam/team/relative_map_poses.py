@@ -45,7 +45,7 @@ class RobotRun:
     """
 
     backend: SlamBackend  # its SLAM, with the map
-    frames: Sequence[RGBDFrame]  # N, what it saw
+    frames: Sequence[RGBDFrame]  # N, all that it captured
     estimates: Float64  # (N, 4, 4) T_map_camera, in the frame of its own map
     tracked: NDArray[np.bool_]  # (N,) bool
 

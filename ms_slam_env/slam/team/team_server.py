@@ -27,8 +27,7 @@ from ms_slam_env.slam.sparse.pose_graph import Edge, optimise_poses
 from ms_slam_env.slam.team.relative_map_poses import RobotRun
 
 AGREE_M, AGREE_DEG = 0.2, 5.0
-"""A keyframe is left out if its pose in another map differs by more from the merged maps.
-"""
+"""A keyframe is left out if its pose in another map is farther from that of the merged maps."""
 LEAST_SHARE = 0.6  # share of a keyframe's points that must lie on the other map
 MATCH_M, MATCH_RAD = 0.01, 0.006  # standard deviation of a keyframe registered in another map
 _FAR_M = 4.0  # readings beyond are too noisy to be registered
