@@ -1,4 +1,4 @@
-"""What tells right alignments from wrong ones, and what the decision on them makes of both."""
+"""Which features separate right from wrong alignments, and how well the tracker decides."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from ms_slam_env.slam.surfel.submaps import FrameLookup
 RIGHT_M, RIGHT_RAD = 0.02, 0.02
 WRONG_M, WRONG_RAD = 0.05, 0.05
 WARM_UP = 20  # frames before the first alignment, so that there is a map
-AWAY_M, AWAY_DEG = 0.15, 12.0  # standard deviations of a start that is moved away
+AWAY_M, AWAY_DEG = 0.15, 12.0  # standard deviations of a displaced start
 TRACKED, MOVED, ELSEWHERE = "tracked", "moved", "elsewhere"
 
-FEATURES = {  # name to its sign: more of it speaks for (1) or against (-1) a pose
+FEATURES = {  # name to sign: a larger value speaks for (1) or against (-1) a pose
     "overlap": 1,
     "inlier_ratio": 1,
     "depth_conflict_ratio": -1,
@@ -45,7 +45,7 @@ FEATURES = {  # name to its sign: more of it speaks for (1) or against (-1) a po
     "sigma_m": -1,
     "degenerate_directions": -1,
 }
-VIEW_FEATURES = ("overlap", "inlier_ratio", "correlation")  # of the frame on the map's view
+VIEW_FEATURES = ("overlap", "inlier_ratio", "correlation")  # of frame and map's view
 THRESHOLDS, APPEAL, UNCERTAIN = "thresholds", "with appeal", "uncertain too"
 
 
@@ -63,11 +63,11 @@ class RocSpec:
 class AcceptanceRoc(Experiment, Checked):
     """Right and wrong alignments: what tells them apart
 
-    A map grows from frames that are all fused where alignment puts them. Now and then a frame is
-    aligned from the last pose, from a pose that is moved away, and a frame of another time from
-    there: the pose found is right within 2 cm and 0.02 rad of where the true motion leads, wrong
-    beyond 5 cm or 0.05 rad. Features that start with "view" compare the frame with the map's view
-    from the pose that was found.
+    The map is built by fusing every frame at its aligned pose. At regular intervals, a frame is
+    aligned from the last pose and from a displaced pose, and a frame of another time from the last
+    pose. The pose found is right within 2 cm and 0.02 rad of the one that follows from the true
+    motion, and wrong beyond 5 cm or 0.05 rad. Features that start with "view" compare the frame
+    with the map's view from the pose found.
     """
 
     sequences: tuple[str, ...] = (
@@ -80,11 +80,11 @@ class AcceptanceRoc(Experiment, Checked):
     )
     """Folders of recordings with truth, or scene:seed[:word[+word ...]]."""
     image_size: str = "160x120+crop"
-    """Of the images."""
+    """Image size."""
     frames: int = bounded(200, WARM_UP + 2, 100_000)
-    """Of each rendered sequence."""
+    """Number of frames of each rendered sequence."""
     every: int = bounded(5, 1, 100_000)
-    """Frames from one set of alignments to the next."""
+    """Number of frames from one set of alignments to the next."""
 
     unit = "sequences"
 
@@ -119,7 +119,7 @@ class AcceptanceRoc(Experiment, Checked):
         return collected([one for one in found if one["is_right"] is not None])
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """What each decision makes of right and wrong alignments, and how each feature tells."""
+        """Outcome of each decision rule, and how well each feature separates the alignments."""
         decisions: list[dict[str, Any]] = [
             {"decision": name, **shares([row["result"] for row in finished(rows)], name)}
             for name in (THRESHOLDS, APPEAL, UNCERTAIN)
@@ -140,7 +140,7 @@ class AcceptanceRoc(Experiment, Checked):
         ]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Right ones kept over wrong ones kept, for every limit on a feature, and the decisions."""
+        """Right over wrong alignments accepted, for every threshold on a feature; decisions."""
         series = []
         for name in _names():
             right, wrong = _scores(rows, name)
@@ -187,7 +187,7 @@ def judge(
 
 
 def first_status(alignment: Alignment, config: SurfelConfig) -> TrackingStatus:
-    """What ordinary tracking says, but for the motion, which is that from a start moved away."""
+    """The status that ordinary tracking gives, ignoring the motion, as the start is displaced."""
     none = np.zeros(1, dtype=np.int32)
     limits = acceptance_thresholds(config.acceptance, none.astype(bool), none)[0]
     limits["motion_m"], limits["rotation_cos"] = np.inf, -np.inf
@@ -220,7 +220,7 @@ def collected(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def shares(results: Sequence[Mapping[str, Any]], decision: str) -> dict[str, float]:
-    """Right ones that a decision refuses and wrong ones that it accepts, of all sequences."""
+    """Shares of right alignments refused and wrong ones accepted, over all sequences."""
     right = sum(result["right_alignments"] for result in results)
     wrong = sum(result["wrong_alignments"] for result in results)
     own = [one for r in results for one in r["decisions"] if one["decision"] == decision]

@@ -1,4 +1,4 @@
-"""Run-time adaptation against fixed configurations (Saeedi et al., ICRA 2017, section V-B)."""
+"""Compare run-time adaptation with fixed configurations (Saeedi et al., ICRA 2017, V-B)."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ ALSO = (
     SlamConfiguration(image_size="160x120"),
     SlamConfiguration(),
 )
-"""Fixed configurations that run too: what others may pick as the best one."""
+"""Further fixed configurations, which others might consider the best."""
 METRICS = (
     *("cpu_ms_mean", "ate_interpolated_m", "ate_m", "ate_tracked_m", "tracked_share"),
     *("processed_share", "lost_share", "cpu_quiet_ms", "cpu_violent_ms"),
 )
-_SMALLEST_CHANGE = 1e-4  # nats; what is below is drawn there
+_SMALLEST_CHANGE = 1e-4  # nats; smaller changes are drawn here
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class AdaptationSpec:
     """One sequence, run by every competitor; see :class:`Adaptation` for the other fields.
 
     Attributes:
-        seed: of the scene, the path and the sensor noise.
-        adaptation: what is compared with each of its configurations.
+        seed: seed of the scene, the path and the sensor noise.
+        adaptation: adaptation to compare with each of its configurations.
     """
 
     scene: str
@@ -70,8 +70,8 @@ class AdaptationSpec:
 class Adaptation(Experiment, Checked):
     """Adaptation by divergence against each of its configurations and the full image size
 
-    Sequences are quiet and violent by turns; every SLAM is shown the same frames. Times are true
-    with one worker on a quiet machine.
+    Sequences alternate between calm and violent motion; all competitors get the same frames. Times
+    are valid only with one worker on an idle machine.
     """
 
     scenes: tuple[str, ...] = ("living_room", "corridor", "table")
@@ -81,25 +81,25 @@ class Adaptation(Experiment, Checked):
     seeds: str = "validation"
     """Split that the seeds come from."""
     image_size: str = "320x240"
-    """Of the camera."""
+    """Image size of the camera."""
     stretches: MotionSegments = field(default_factory=MotionSegments)
-    """How the camera is carried."""
+    """How the camera moves."""
     configurations: tuple[Path, ...] = ()
-    """YAML files, from fast to robust; none for the default three."""
+    """YAML files, from fast to robust; by default three built-in ones."""
     levels: Path | None = None
-    """File of levels that ms-slam explore wrote, in place of configurations and thresholds."""
+    """File of levels written by ms-slam explore, instead of configurations and thresholds."""
     thresholds: tuple[float, ...] = DivergenceAdaptationConfig.thresholds
-    """Of the change between frames, nats, one between any two configurations."""
+    """Thresholds of the change between frames, nats, one between neighbouring configurations."""
     release_share: float = DivergenceAdaptationConfig.release_share
-    """Of the thresholds, below which the way down is open."""
+    """Share of a threshold below which adaptation may return to the faster configuration."""
     dwell_frames: int = DivergenceAdaptationConfig.dwell_frames
-    """Frames below before the way down is taken."""
+    """Number of frames for which the change must stay below that share first."""
 
     unit = "sequences"
     workers = 1
 
     def adaptation(self) -> DivergenceAdaptationConfig:
-        """What is to be judged."""
+        """The adaptation to evaluate."""
         names = ("levels", "thresholds", "release_share", "dwell_frames")
         own = {name: getattr(self, name) for name in names}
         return DivergenceAdaptationConfig(configurations=self.configurations or None, **own)
@@ -114,7 +114,7 @@ class Adaptation(Experiment, Checked):
 
     @staticmethod
     def run(spec: AdaptationSpec) -> dict[str, Any]:
-        """Every competitor, the adaptive one last; change and level are its own, frame by frame."""
+        """Run every competitor, the adaptive one last, whose change and level are kept by frame."""
         sequence = open_sequence(f"{spec.scene}:{spec.seed}", spec.image_size, path=spec.stretches)
         frames = list(sequence.frames)
         violent = spec.stretches.is_violent()
@@ -127,13 +127,13 @@ class Adaptation(Experiment, Checked):
         return {"runs": runs, "change": [round(x, 6) for x in changes], "level": levels}
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """Every competitor's figures, then what adaptation cuts of them."""
+        """Results of every competitor, then how much adaptation saves compared with each."""
         runs = flattened(rows, "runs")
         note = f"Medians of {len(finished(rows))} sequences with 95 % intervals."
         return [Grouping(("configuration",), METRICS).table(runs, note=note), comparison(runs)]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Error against time, and the first sequence along time."""
+        """Error against time per frame, and the first sequence over time."""
         series = []
         for (name,), runs in grouped(flattened(rows, "runs"), ("configuration",)).items():
             ms, ate = ([run[key] for run in runs] for key in ("cpu_ms_mean", "ate_interpolated_m"))
@@ -154,7 +154,7 @@ class Adaptation(Experiment, Checked):
 def competitors(
     adaptation: DivergenceAdaptationConfig, intrinsics: Intrinsics
 ) -> dict[str, SlamBackend]:
-    """Each configuration alone, the default ones with every frame, and the adaptation, last."""
+    """Each configuration alone, the further fixed ones, and the adaptation, last."""
     given = adaptation.resolved(intrinsics)
     sizes = [XTION_SIZES[one.image_size] if one.image_size else (0, 0) for one in ALSO]
     also = [one for one, size in zip(ALSO, sizes, strict=True) if size[0] <= intrinsics.width]
@@ -163,7 +163,7 @@ def competitors(
         name: AgentConfig(configurations=(one, one), start=0).adapt(slam.make("surfel", intrinsics))
         for name, one in fixed.items()
     }
-    # The same without the first change of configuration, which is from the default to the first.
+    # The same, but without the initial change from the default to the first configuration.
     adaptive = replace(adaptation, configurations=given).adapt(slam.make("surfel", intrinsics))
     return {**alone, ADAPTIVE: adaptive}
 
@@ -171,10 +171,10 @@ def competitors(
 def judge(
     backend: SlamBackend, frames: Sequence[RGBDFrame], truth: Float64, violent: NDArray[np.bool_]
 ) -> tuple[dict[str, float | None], list[int], list[float]]:
-    """Run a SLAM over N frames with true poses (N, 4, 4); ``violent`` (N,) says which are.
+    """Run SLAM over N frames with true poses (N, 4, 4); ``violent`` (N,) marks fast motion.
 
     Returns:
-        figures; level and change of every frame.
+        metrics; level and change of every frame.
     """
     levels: list[int] = []
     changes: list[float] = []
@@ -205,7 +205,7 @@ def judge(
 
 
 def comparison(runs: Sequence[Row]) -> Table:
-    """What adaptation cuts of each fixed configuration's median time and error, paired."""
+    """How much adaptation cuts each fixed configuration's median time and error, paired."""
     columns = ("configuration", "cpu_cut", "ate_cut", "better_share")
     by_name = {name: results for (name,), results in grouped(runs, ("configuration",)).items()}
     own = by_name.pop(ADAPTIVE, [])
@@ -226,7 +226,7 @@ def comparison(runs: Sequence[Row]) -> Table:
 
 
 def _time_line(row: Mapping[str, Any]) -> Chart:
-    """Change between frames with its thresholds, and the configuration in force."""
+    """Change between frames with its thresholds, and the active configuration."""
     spec, result = row["spec"], row["result"]
     violent = MotionSegments(**spec["stretches"]).is_violent()
     frames = list(range(len(violent)))

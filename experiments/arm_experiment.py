@@ -1,6 +1,6 @@
 """The paper's robot experiment, four settings, ten runs each: is the map consistent?
 
-Saeedi et al., ICRA 2017, section VI-C and figure 9.
+Saeedi et al., ICRA 2017, section VI-C and Fig. 8.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from ms_slam_env.report.tables import Grouping, Table, finished, make_table
 
 SCENES = ("window", "table", "wall", "carpet")
 FRAME_RATE_HZ = 30  # no motion is shorter than a frame of the fastest camera
-MOST_VIEWS = 200  # of an episode's frames, evenly picked: the verdict costs some 3 s
+MOST_VIEWS = 200  # evenly picked frames of an episode; judging them takes about 3 s
 METRICS = (
     *("success", "success_tracked", "lost", "lost_frames_share", "mapped_area_m2", "ate_m"),
     *("ate_tracked_m", "tracked_share", "worst_apart_share", "path_length_m", "energy_j", "steps"),
@@ -58,7 +58,7 @@ METRICS = (
 LAMP = {"dim": 0.0, "lamp": 0.3, "speed_m_s": 0.001}  # "minor changes in illumination"
 ACTIVE, BASELINE = "greedy", "random"
 PAPER = {"carpet": f"{BASELINE} 0 of 10, {ACTIVE} 5 of 10"}
-"""Successes that the paper's text states; its other bars are in its figure 9 alone."""
+"""Successes stated in the paper's text; the others are only bars in its Fig. 8."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,9 @@ class RunSpec(EpisodeSpec):
 
     Attributes:
         seconds: simulated time after which the run ends.
-        rule: when its map has failed.
-        picture: where a picture of the judged map goes; empty for none.
-        same_start: whether the run begins where one with the scene's seed begins.
+        rule: rule by which its map fails.
+        picture: file for a picture of the judged map; none if empty.
+        same_start: whether the run starts at the start of a run with the scene's seed.
     """
 
     seconds: float = 60.0
@@ -90,7 +90,7 @@ class RunSpec(EpisodeSpec):
 class ArmExperiment(Experiment):
     """The paper's robot experiment: does a planner's map show an object twice?
 
-    Standing still succeeds trivially: read success beside the mapped area.
+    A camera that stands still succeeds trivially, so success must be read with the mapped area.
     """
 
     planners: tuple[str, ...] = DEFAULT_PLANNERS
@@ -98,7 +98,7 @@ class ArmExperiment(Experiment):
     scenes: tuple[str, ...] = SCENES
     """Names of scenes, or mesh files."""
     episodes: int = 10
-    """Runs for each scene and planner, each with a seed of its own."""
+    """Runs for each scene and planner, each with a different seed."""
     seconds: float = 60.0
     """Simulated time of a run."""
     step_m: float = DEFAULT_STEP_M
@@ -108,7 +108,7 @@ class ArmExperiment(Experiment):
     env_id: str = "MSActiveSLAM-v0"
     """Environment; the default one has the arm."""
     embodiment: str | None = None
-    """What carries the camera, where it is not the environment's own."""
+    """Embodiment of the camera, if it differs from the environment's."""
     seeds: str = "test"
     """Split that the seeds come from."""
     options: tuple[str, ...] = ()
@@ -147,10 +147,10 @@ class ArmExperiment(Experiment):
             env.close()
 
     def specs(self) -> list[RunSpec]:
-        """Every run; those of one scene and seed are neighbours and share its geometry."""
+        """Every run; runs with the same scene and seed are neighbours and share its geometry."""
         check_players(self.planners, self.scenes)
         options = parse_options(self.options)
-        # A run goes on when tracking is lost, as the paper's did.
+        # A run continues when tracking is lost, as in the paper.
         options.setdefault("lost_patience", 1_000_000)
         if self.embodiment is not None:
             options["embodiment"] = self.embodiment
@@ -184,7 +184,7 @@ class ArmExperiment(Experiment):
         check_episodes(self.specs())
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line a scene and planner; successes beside the paper's."""
+        """One line per scene and planner; successes compared with the paper's."""
         note = (
             f"Runs of {self.seconds:g} simulated seconds. Shares of runs with 95 % Wilson "
             "intervals, medians with 95 % bootstrap intervals."
@@ -235,9 +235,9 @@ def _outcome(world: ActiveSlamEnv, judged: JudgedMap) -> dict[str, Any]:
 
 
 def compare(rows: Sequence[Row]) -> list[dict[str, str | None]]:
-    """Successes of the greedy planner and of random walk by scene, and who has the greater share.
+    """Successes of the greedy planner and of random walk by scene, and which has more.
 
-    Options of a planner do not count; nobody is better where one has no runs.
+    Ignores options of a planner; neither is better if one has no runs.
     """
     flags: dict[tuple[str, str], list[bool]] = {}
     for row in finished(rows):
@@ -260,8 +260,8 @@ def compare(rows: Sequence[Row]) -> list[dict[str, str | None]]:
 
 CAMERA = Intrinsics(fx=460.0, fy=460.0, cx=319.5, cy=239.5, width=640, height=480)
 RED = (225, 30, 30)
-_NEAREST_M = 0.35  # what hangs in front of the eye would hide the rest
-_DOT_M = 0.014  # the points are a centimetre apart
+_NEAREST_M = 0.35  # closer points would hide the rest of the view
+_DOT_M = 0.014  # the points are 1 cm apart
 
 
 def save_map_picture(judged: JudgedMap, cameras: ArrayLike, path: Path, title: str) -> Path:
@@ -270,8 +270,8 @@ def save_map_picture(judged: JudgedMap, cameras: ArrayLike, path: Path, title: s
     Args:
         judged: the map and its verdict.
         cameras: (K, 3) estimated positions of the camera.
-        path: of the PNG.
-        title: what map this is; the verdict is appended.
+        path: PNG file to write.
+        title: title, to which the verdict is appended.
     """
     pose = overview_pose(judged.points, np.asarray(cameras))
     panels = {
@@ -288,7 +288,7 @@ def save_map_picture(judged: JudgedMap, cameras: ArrayLike, path: Path, title: s
 
 
 def _marked(judged: JudgedMap, pose: Float64) -> Image:
-    """The map, faded, with the second copies drawn over what hides them."""
+    """The map, faded, with second copies drawn on top."""
     faded = (0.35 * judged.colors + 0.65 * 235).astype(np.uint8)
     image = overview(judged.points, faded, pose)
     copies = judged.points[judged.consistency.apart]
@@ -297,7 +297,7 @@ def _marked(judged: JudgedMap, pose: Float64) -> Image:
 
 
 def describe(judged: JudgedMap) -> str:
-    """The verdict in words, with the objects that are there twice, the worst five first."""
+    """The verdict in words, with the five worst objects that the map shows twice."""
     twice = judged.consistency.duplicated
     if not twice:
         return "success, no object is there twice"
@@ -316,7 +316,7 @@ def overview_pose(points: Float64, cameras: Float64) -> Float64:
 
 
 def overview(points: Float64, colors: ArrayLike, T_world_camera: Float64) -> Image:
-    """Points (N, 3) with colours (N, 3) uint8 as `CAMERA` sees them, without those near its eye."""
+    """Points (N, 3) with colours (N, 3) uint8 as seen by `CAMERA`, without those close to it."""
     ahead = transform_points(invert(T_world_camera), points)[:, 2] > _NEAREST_M
     points, shades = points[ahead], np.asarray(colors, dtype=np.uint8)[ahead]
     return render_points(CAMERA, T_world_camera, points, shades, np.full(len(points), _DOT_M))

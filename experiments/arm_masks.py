@@ -1,4 +1,4 @@
-"""How often the arm's action mask is right, and how far the arm is from where it should be."""
+"""How often the arm's action mask is right, and how far the arm is from its commands."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class WalkSpec:
     """One random walk of the arm; see :class:`ArmMasks` for the other fields.
 
     Attributes:
-        seed: of the scene, the start pose, the arm's errors and the walk.
+        seed: seed of the scene, the start pose, the arm's errors and the walk.
         arm: options of the arm.
     """
 
@@ -69,9 +69,9 @@ class WalkSpec:
 class ArmMasks(Checked, Experiment):
     """Is the arm's mask of motions right?
 
-    Along random walks every one of the 49 motions is really attempted, with controller and physics,
-    from the saved state, whatever the mask says. A motion is possible if the arm says it made it
-    and the truth finds that it touched nothing; the mask is right if it allows exactly those.
+    Along random walks, each of the 49 motions is attempted with controller and physics from the
+    same saved state, whatever the mask says. A motion is possible if the arm reports success and,
+    in truth, touched nothing. The mask is right if it allows exactly the possible motions.
     """
 
     scenes: tuple[str, ...] = DEFAULT_SCENES
@@ -83,7 +83,7 @@ class ArmMasks(Checked, Experiment):
     moves: int = bounded(3, 0, 10_000)
     """Permitted motions before each of them."""
     approach: float = bounded(0.5, 0, 1)
-    """Share of those that go where the camera comes nearest to furniture; the others are random."""
+    """Share of those that bring the camera closest to furniture; the others are random."""
     step_m: float = bounded(DEFAULT_STEP_M, 0, 1)
     """Translation of a motion, metres."""
     step_deg: float = bounded(DEFAULT_STEP_DEG, 0, 90)
@@ -100,8 +100,8 @@ class ArmMasks(Checked, Experiment):
         """Walk, and attempt every motion at every stop.
 
         Returns:
-            ``cases``, columns with one entry a motion attempted, and ``stops``, columns with one
-            entry a stop; see the registry of metrics for each.
+            ``cases``, columns with one entry per attempted motion, and ``stops``, columns with one
+            entry per stop; see the metric registry for each column.
         """
         config = from_dict(EnvConfig, {"arm": spec.arm}).arm
         scene = scene_library.make(spec.scene, spec.seed)
@@ -134,13 +134,13 @@ class ArmMasks(Checked, Experiment):
         return self.each(WalkSpec, scene=self.scenes, seed=seeds, arm=(options.get("arm", {}),))
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """The mask by scene and by what it says, causes of wrong permissions, errors of the arm."""
+        """The mask by scene and by reason, causes of wrong permissions, errors of the arm."""
         return mask_tables(rows)
 
 
 @lru_cache(maxsize=1)
 def furniture_of(scene: str, seed: int) -> Cloud:
-    """The true surface of a scene, kept for the next walk in it."""
+    """The true surface of a scene, cached for the next walk in it."""
     return furniture_cloud(scene_library.make(scene, seed))
 
 
@@ -156,7 +156,7 @@ def start_arm(arm: A, rng: np.random.Generator) -> A:
 
 
 def choose_move(arm: DynamicArm, approach: float, rng: np.random.Generator) -> int:
-    """A permitted motion: with probability ``approach`` the one nearest to furniture."""
+    """A permitted motion: with probability ``approach``, the one that ends closest to furniture."""
     allowed = np.flatnonzero(arm.action_masks())
     if rng.random() >= approach:
         return int(rng.choice(allowed))
@@ -166,7 +166,7 @@ def choose_move(arm: DynamicArm, approach: float, rng: np.random.Generator) -> i
 
 
 def judge(arm: DynamicArm, truth: ArmTruth, action: int) -> dict[str, Any]:
-    """Attempt one motion and see what it came near to."""
+    """Attempt one motion and measure its gaps."""
     attempt = arm.attempt(action)
     index = np.linspace(0, len(attempt.q) - 1, min(_JUDGED_POSTURES, len(attempt.q)))
     postures = attempt.q[np.rint(index).astype(np.int64)]
@@ -181,7 +181,7 @@ def judge(arm: DynamicArm, truth: ArmTruth, action: int) -> dict[str, Any]:
 
 
 def at_rest(arm: DynamicArm, T_world_kinematic: Float64) -> dict[str, float]:
-    """How far the camera is from its command and from a kinematic pose (4, 4)."""
+    """Distance of the camera from its command and from a kinematic pose (4, 4)."""
     _, T_base_commanded = arm.planning_state()
     commanded = (arm.T_world_base @ T_base_commanded)[:3, 3]
     here = arm.T_world_camera
@@ -212,9 +212,9 @@ def _append(columns: dict[str, list[Any]], row: dict[str, Any]) -> None:
 
 
 FAR_M = 0.1
-"""Gaps are exact up to this; what is farther away counts as this far."""
+"""Gaps are exact up to this distance; larger ones count as this far."""
 
-_SPACING_M = 0.005  # of a cloud's points: a gap of 2 cm comes out at most 0.3 mm too large
+_SPACING_M = 0.005  # of a cloud's points; overestimates a gap of 2 cm by at most 0.3 mm
 _CELL_M = 0.04  # of the coarse cloud
 _CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
@@ -223,7 +223,7 @@ _ELLIPSOID = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
 
 
 class Cloud:
-    """Points (N, 3) of a surface, to be found by place."""
+    """Points (N, 3) of a surface, indexed by position."""
 
     def __init__(self, points: Float64) -> None:
         self._points = np.asarray(points, dtype=np.float64)
@@ -246,7 +246,7 @@ def furniture_cloud(scene: Scene, spacing_m: float = _SPACING_M) -> Cloud:
 
 
 def floor_below(scene: Scene, point: Float64) -> float:
-    """Height of the surface under a point (3,); the point's own where there is none."""
+    """Height of the surface below a point (3,), or the point's height if there is none."""
     camera = Intrinsics(fx=1, fy=1, cx=0, cy=0, width=1, height=1)
     start = point + np.array([0, 0, 0.01])
     down = make_pose(np.diag([1.0, -1.0, -1.0]), start)
@@ -255,7 +255,7 @@ def floor_below(scene: Scene, point: Float64) -> float:
 
 
 def column_cloud(radius: float, depth: float) -> Cloud:
-    """The column under an arm's base at the origin: round top at the base's plane, to a depth."""
+    """The column below an arm's base at the origin, with a round top at the base's plane."""
     angles = np.arange(0, 2 * np.pi, _SPACING_M / radius)
     ring = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
     tilts = np.arange(0, np.pi / 2, _SPACING_M / radius)
@@ -265,13 +265,13 @@ def column_cloud(radius: float, depth: float) -> Cloud:
 
 
 class ArmTruth:
-    """Judges postures of an arm on its base by its colliding geoms; the base itself is left out.
+    """Checks postures of a mounted arm by its colliding geoms, without the base.
 
     Args:
         model: the arm.
-        furniture: around it, in the world.
-        T_world_base: (4, 4) where it stands.
-        column: under it, in the frame of the base; None without.
+        furniture: surface around it, world frame.
+        T_world_base: (4, 4) pose of the base.
+        column: column below it, base frame; None if there is none.
     """
 
     def __init__(
@@ -292,7 +292,7 @@ class ArmTruth:
     def gaps(self, q: Float64) -> Float64:
         """Smallest gap (k,) between moving links and furniture at joint angles (k, n), metres.
 
-        Not positive where they touch.
+        Zero or negative if they touch.
         """
         result = np.empty(len(q))
         for i, one in enumerate(q):
@@ -357,8 +357,8 @@ class ArmTruth:
 def signed_distance(mj: mujoco.MjModel, geom: int, points: Float64) -> Float64:
     """Distance (N,) from points (N, 3) of a geom's frame to its surface, negative inside.
 
-    Exact for balls, capsules, cylinders and boxes; for ellipsoids only near them; meshes by their
-    bounding box.
+    Exact for balls, capsules, cylinders and boxes; for ellipsoids only close to the surface; meshes
+    are treated as their bounding boxes.
     """
     kind, size = int(mj.geom_type[geom]), mj.geom_size[geom]
     if kind == _BALL:
@@ -407,13 +407,13 @@ AT_REST = {
     "camera from its command at rest": ("offset_at_rest_m",),
     "kinematic pose from the true one": ("kinematic_m", "kinematic_rad"),
 }
-"""What is measured of motions that were allowed and made, and of stops: columns of a walk."""
+"""Errors of motions that were allowed and made, and of stops, to columns of a walk."""
 
 Columns = Mapping[str, NDArray[Any]]
 
 
 def mask_tables(rows: Sequence[Row]) -> list[Table]:
-    """By scene, by reason, causes where it allowed wrongly, errors."""
+    """Tables by scene and by reason, of causes of wrong permissions, and of errors."""
     walks = finished(rows)
     places = {place: [row for row in walks if row["spec"]["scene"] == place]
               for place in dict.fromkeys(row["spec"]["scene"] for row in walks)}  # fmt: skip
@@ -466,7 +466,7 @@ def _mask(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _reasons(cases: Columns) -> list[dict[str, Any]]:
-    """By what the mask says: how many, and the share that was right."""
+    """Number of motions, and share that was right, by the mask's reason."""
     possible, lines = _possible(cases), []
     for reason in REASONS:
         said = cases["reason"] == reason
@@ -477,7 +477,7 @@ def _reasons(cases: Columns) -> list[dict[str, Any]]:
 
 
 def _causes(cases: Columns) -> list[dict[str, Any]]:
-    """Why motions that the mask allowed were not possible; one motion can have several causes."""
+    """Why allowed motions were not possible; a motion can have several causes."""
     allowed, stopped = cases["reason"] == ALLOWED, cases["stopped"]
     causes = {
         "not followed": ~cases["reached"] & ~stopped,
@@ -489,7 +489,7 @@ def _causes(cases: Columns) -> list[dict[str, Any]]:
 
 
 def _errors(cases: Columns, stops: Columns) -> Table:
-    """Least, median and 95th percentile; lengths and angles of one thing on one line."""
+    """Smallest, median and 95th percentile of each error, length and angle on one line."""
     moved = (cases["reason"] == ALLOWED) & cases["reached"] & (cases["action"] > 0)
     lines = []
     for columns, kinds in (({n: c[moved] for n, c in cases.items()}, MOVED), (stops, AT_REST)):
@@ -509,7 +509,7 @@ def _errors(cases: Columns, stops: Columns) -> Table:
 
 
 def _spread(values: NDArray[np.float64]) -> dict[str, float]:
-    """Least, median and 95th percentile."""
+    """Smallest, median and 95th percentile."""
     if not len(values):
         return dict.fromkeys(("least", "median", "p95"), float("nan"))
     least, median, p95 = np.percentile(values, [0, 50, 95])

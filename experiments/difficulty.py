@@ -42,7 +42,7 @@ PAPER = {
 }
 """Table I of the paper: max, mean and "variance" of the intensity divergence."""
 RECORDING = "recorded depth"
-"""Scene of a row that was recorded, not rendered."""
+"""Scene name of a recorded row."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,15 @@ class DifficultySpec:
 
     Attributes:
         scene: name, mesh file, or ``RECORDING``.
-        motion: such as ``lr_kt0``.
-        motions: all that are placed together.
+        motion: name such as ``lr_kt0``.
+        motions: all motions that are placed together.
         data: folder of the trajectories and recordings.
         placement: seed of the place.
         scale: factor on all motions.
-        image_size: of the rendered images; recorded ones are at most as large.
-        noise: of the rendered images.
+        image_size: size of rendered images; recorded ones are at most as large.
+        noise: noise of the rendered images.
         every: take every n-th frame.
-        first: take so many frames only; 0: all.
+        first: number of first frames to take; 0 for all.
     """
 
     scene: str
@@ -78,10 +78,10 @@ class DifficultySpec:
 class Difficulty(Checked, Experiment):
     """Difficulty of motions
 
-    The divergence from frame to frame along the ICL-NUIM motions, beside the order that the paper
-    found (kt2 and kt3 harder than kt0 and kt1): in lr_kt3's recorded depth, and in other scenes,
-    where all four are placed as one rigid whole, at one scale, at several places, because what a
-    camera sees differs from place to place.
+    Measures the divergence between frames along the ICL-NUIM motions, and compares it with the
+    paper's order (kt2 and kt3 harder than kt0 and kt1). It uses lr_kt3's recorded depth and other
+    scenes, in which all four motions are placed together at one scale, at several places, because
+    the view differs between places.
     """
 
     data: Path | None = None
@@ -93,7 +93,7 @@ class Difficulty(Checked, Experiment):
     placements: int = bounded(3, 1, 1000)
     """Places of the motions in each scene."""
     image_size: str = chosen("320x240", *XTION_SIZES)
-    """Of the rendered images, with the field of view of ICL-NUIM's camera."""
+    """Size of the rendered images, with the field of view of ICL-NUIM's camera."""
     noise: tuple[str, ...] = ("none",)
     """Noise of the rendered images: none, kinect, or both."""
     every: int = bounded(1, 1, 1000)
@@ -108,9 +108,10 @@ class Difficulty(Checked, Experiment):
             noise_config(name)
 
     def specs(self) -> list[DifficultySpec]:
-        """The recording, and every motion at every place; what was recorded also as far as that.
+        """The recording, and every motion at every place.
 
-        The scale is the largest at which all motions together fit at every place of every scene.
+        A recorded motion appears once more, cut to the recording's length. The scale is the largest
+        at which all motions together fit at every place of every scene.
 
         Raises:
             InputError: a scene, trajectory or recording that cannot be read, or no place.
@@ -142,7 +143,7 @@ class Difficulty(Checked, Experiment):
 
     @staticmethod
     def run(spec: DifficultySpec) -> dict[str, Any]:
-        """Statistics of the divergence, how camera and image move, and what they see."""
+        """Statistics of the divergence, the motion of camera and image, and the images."""
         watched = watch(spec)
         lines, curves = [], []
         for (name, values), (column, kind) in product(
@@ -171,7 +172,7 @@ class Difficulty(Checked, Experiment):
         }
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """Statistics, motions, the paper's, the order, and what the divergence goes with."""
+        """Statistics, motions, the paper's table, the order, and correlations of the divergence."""
         lines = statistics(rows)
         which = ("scene", "noise", "motion")
         once = {tuple(map(line.get, which)): line for line in lines}
@@ -200,7 +201,7 @@ class Difficulty(Checked, Experiment):
         ]  # fmt: skip
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Divergence over time at the first place, a chart for each scene and histogram."""
+        """Divergence over time at the first place, a chart per scene and histogram."""
         found: dict[tuple[str, str, str], dict[str, list[Series]]] = {}
         for row in finished(rows):
             spec = row["spec"]
@@ -245,7 +246,7 @@ def _open(spec: DifficultySpec) -> RGBDSequence:
 Line = dict[str, Any]
 
 HARD, EASY = ("lr_kt2", "lr_kt3"), ("lr_kt0", "lr_kt1")
-"""What the paper finds: every motion of the first pair harder than every one of the second."""
+"""Order found by the paper: both motions of the first pair are harder than those of the second."""
 STATISTICS = tuple(
     f"divergence_{name}"
     for name in ("max", "mean", "variance", "std", "max_per_s", "mean_per_s", "std_per_s")
@@ -253,14 +254,14 @@ STATISTICS = tuple(
 ORDERED = ("max", "mean", "std")
 SEEN = ("contrast", "depth_m")
 CORRELATIONS = ("turn_correlation", "speed_correlation", "image_motion_correlation")
-"""Of the divergence with each of ``MOTIONS``."""
+"""Correlations of the divergence with each of ``MOTIONS``."""
 WHERE = ("scene", "noise", "histograms", "divergence")
 
 
 def statistics(rows: Sequence[Row]) -> list[Line]:
-    """Of every motion in a scene, histogram and kind: means over its places.
+    """Means over places, for every scene, motion, histogram and kind.
 
-    Of a motion that was also recorded there is a second line, over as many frames as that.
+    A motion that was also recorded has a second line, over as many frames as the recording.
     """
     fields = (*WHERE, "motion")
     keys = (*STATISTICS, *MOTIONS, *SEEN)
@@ -276,14 +277,14 @@ def statistics(rows: Sequence[Row]) -> list[Line]:
 
 
 def judgements(rows: Sequence[Row]) -> list[Line]:
-    """Of every scene, histogram and kind: whether the paper's order holds, and correlations.
+    """Whether the paper's order holds, and correlations, for every scene, histogram and kind.
 
-    ``pairs_max``, ``pairs_mean``, ``pairs_std``: of the four pairs of a motion that the paper finds
-    hard and one that it finds easy, in how many the former has the larger statistic (means over
-    the places); ``places_max`` and so on: in how many single places all four pairs hold.
+    ``pairs_max``, ``pairs_mean``, ``pairs_std``: number of pairs, out of four, in which the motion
+    that the paper finds hard has a larger statistic than the easy one (means over the places);
+    ``places_max`` and so on: number of places at which this holds for all four pairs.
 
-    Spearman correlations of the divergence with how the camera and the image move: frame by frame
-    within one motion at one place, the median over motions and places; and ``motions_...``, of the
+    Spearman correlations of the divergence with the motion of camera and image: frame by frame
+    within one motion at one place, median over motions and places; and ``motions_...``, of the
     motions' means over all places of a scene.
     """
     lines = _lines([row for row in rows if not row["spec"]["first"]])
@@ -328,7 +329,7 @@ def _correlations(by_motion: Mapping[str, Sequence[Mapping[str, Any]]]) -> Line:
 
 
 def _lines(rows: Sequence[Row]) -> list[Row]:
-    """A row for each histogram and kind of each finished row, with what those have in common."""
+    """A row for each histogram and kind of each finished row, with the row's common values."""
     lines: list[Row] = []
     for row in finished(rows):
         spec, result = row["spec"], row["result"]
@@ -349,20 +350,20 @@ def _lines(rows: Sequence[Row]) -> list[Row]:
 MOTIONS = ("turn_deg_s", "speed_m_s", "image_motion_deg_s")
 """Columns of `frame_motion`."""
 
-_PIXELS_ACROSS = 40  # of the grid of points that are followed
+_PIXELS_ACROSS = 40  # columns of the grid of tracked points
 
 
 @dataclass(frozen=True)
 class WatchedSequence:
-    """How T + 1 frames follow each other.
+    """Measures between T + 1 consecutive frames.
 
     Attributes:
-        times_s: (T,) of the later frame of each pair, since the first.
-        gaps_s: (T,) between the frames of each pair.
+        times_s: (T,) times of the later frame of each pair, since the first frame.
+        gaps_s: (T,) times between the frames of each pair.
         divergences: by name of the histograms, (T, 2) intensity and depth, nats.
         motion: by ``MOTIONS``, (T,).
-        contrast: mean over the frames of the grey values' standard deviation.
-        depth_m: mean over the frames of their mean depth.
+        contrast: standard deviation of the grey values, mean over the frames.
+        depth_m: mean depth, mean over the frames.
     """
 
     times_s: Float64
@@ -376,10 +377,10 @@ class WatchedSequence:
 def watch_frames(
     sequence: RGBDSequence, histograms: Mapping[str, DivergenceConfig]
 ) -> WatchedSequence:
-    """Measure each frame against the one before, once through; without colour intensity is NaN.
+    """Compare each frame with the one before, in one pass; without colour, intensity is NaN.
 
     Args:
-        sequence: with true poses.
+        sequence: sequence with true poses.
         histograms: settings of the divergence by name.
     """
     times, poses, K = sequence.timestamps, sequence.poses, sequence.intrinsics
@@ -410,12 +411,12 @@ def watch_frames(
 def by_second(
     times_s: Float64, values: Float64, gaps_s: Float64
 ) -> tuple[list[float], list[float]]:
-    """Middles of the seconds, and the rates in them: sum of the values by that of the gaps.
+    """Middle of each second, and the rate in it: sum of the values over sum of the gaps.
 
     Args:
-        times_s: (T,) since the first frame.
-        values: (T,) between two frames.
-        gaps_s: (T,) between the two frames.
+        times_s: (T,) times since the first frame.
+        values: (T,) values between two frames.
+        gaps_s: (T,) times between the two frames.
     """
     second = times_s.astype(int)
     filled = np.bincount(second) > 0
@@ -426,14 +427,14 @@ def by_second(
 def frame_motion(
     frame: RGBDFrame, T_world_camera: Float64, T_world_next: Float64, K: Intrinsics, gap_s: float
 ) -> Float64:
-    """How fast the camera and its image move from a frame to the next, (3,) as in ``MOTIONS``.
+    """Speeds of the camera and of its image from one frame to the next, (3,) as in ``MOTIONS``.
 
-    ``turn_deg_s`` and ``speed_m_s`` are the camera's; ``image_motion_deg_s`` is the mean angle by
-    which the surface points of the frame move in the camera's view, which depends on how far away
-    they are; without a depth reading it is NaN.
+    ``turn_deg_s`` and ``speed_m_s`` are the camera's. ``image_motion_deg_s`` is the mean angle by
+    which the surface points of the frame move in the camera's view, which depends on their
+    distance; it is NaN without depth readings.
 
     Args:
-        frame: with depth.
+        frame: frame with depth.
         T_world_camera: (4, 4) its pose.
         T_world_next: (4, 4) pose of the next frame.
         K: intrinsics of the frame.

@@ -1,4 +1,4 @@
-"""Does a measure of difficulty go with the error of SLAM? Rank correlations over all sequences."""
+"""Do measures of difficulty predict the error of SLAM? Rank correlations over all sequences."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ class DifficultySpec:
 class DifficultyErrors(Experiment, Checked):
     """Measures of difficulty beside the errors of SLAM
 
-    A data set's difficulty is the mean over its frames of a distance between consecutive ones:
-    divergences of histograms (Saeedi et al., ICRA 2017, Table I), earth mover's distances, and the
-    Wasserstein distance of what is observed (Saeedi et al., ICRA 2019), beside how fast the image
-    moves. Each is set against the errors of each backend by Spearman's correlation over sequences.
+    The difficulty of a data set is the mean distance between consecutive frames: divergences of
+    histograms (Saeedi et al., ICRA 2017, Table I), earth mover's distances, and the Wasserstein
+    distance of the observations (Saeedi et al., ICRA 2019); the speed of the image is added. Each
+    is compared with the errors of each backend by Spearman's correlation over sequences.
     """
 
     sequences: tuple[str, ...] = (*DEFAULT_SEQUENCES, *FAST)
@@ -62,9 +62,9 @@ class DifficultyErrors(Experiment, Checked):
     backends: tuple[str, ...] = tuple(slam.BACKENDS)
     """NAME, parameters appended as in surfel,loop_closure=deformation."""
     image_size: str = "160x120"
-    """Of the images."""
+    """Image size."""
     frames: int = bounded(150, 10, 100_000)
-    """Of a rendered sequence."""
+    """Number of frames of a rendered sequence."""
 
     unit = "sequences"
 
@@ -72,7 +72,7 @@ class DifficultyErrors(Experiment, Checked):
         """Every sequence.
 
         Raises:
-            InputError: fewer than three.
+            InputError: fewer than three sequences.
         """
         if len(self.sequences) < 3:
             raise InputError("a correlation needs at least 3 sequences")
@@ -120,7 +120,7 @@ class DifficultyErrors(Experiment, Checked):
 
 
 def correlations(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Of every measure and backend: Spearman's correlation over the sequences with each error."""
+    """Spearman's correlation, over sequences, of every measure with each error of each backend."""
     results = [row["result"] for row in finished(rows)]
     if not results:
         return []
@@ -134,7 +134,7 @@ def correlations(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def _correlation(results: Sequence[Row], m: int, b: int, key: str) -> float:
-    """Of a measure and an error, over the sequences that have both; NaN of fewer than three."""
+    """Correlation of a measure and an error over sequences with both; NaN for fewer than three."""
     pairs = [(r["measures"][m]["difficulty"], r["backends"][b][key]) for r in results]
     known = [pair for pair in pairs if None not in pair and np.isfinite(pair).all()]
     return rank_correlation(*zip(*known, strict=True)) if len(known) > 2 else float("nan")

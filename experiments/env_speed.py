@@ -1,4 +1,4 @@
-"""Decisions a second of the environment, and where the time of a decision goes."""
+"""Measure the environment's steps per second, and the time of each stage of a step."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ORDER = ("ik", "physics", "move", "mask", "render", "slam", "divergence", "cover
 """Order of the stages in the table; others follow."""
 REST = "rest"
 WITHOUT_FRAMES = ("free", "fixed-translation")
-"""Embodiments that bring one frame a step, whatever ``frames_per_action`` says."""
+"""Embodiments with one frame per step, regardless of ``frames_per_action``."""
 
 
 @dataclass(frozen=True)
@@ -43,32 +43,32 @@ class EnvSpeedSpec:
 class EnvSpeed(Experiment, Checked):
     """Decisions a second with random permitted actions, and where their time goes
 
-    The clock runs during ``env.step`` alone; resets are not counted. Processor time is what a step
-    would take on a core of its own, where the measured time suffers from a busy machine.
+    Only ``env.step`` is timed; resets do not count. Unlike the time by the clock, processor time
+    does not depend on other programs on the machine.
     """
 
     embodiments: tuple[str, ...] = ("arm", "arm-kinematic", "free")
-    """What holds the camera."""
+    """Embodiments of the camera."""
     frames_per_action: tuple[int | None, ...] = (1, None)
-    """Frames of a motion of an arm; None for as many as arrive while it moves."""
+    """Frames per motion of an arm; None for all frames that arrive while it moves."""
     observations: tuple[str, ...] = tuple(OBSERVATIONS)
     """Observation variants."""
     scene: str = "living_room"
     """A scene's name, or a mesh file."""
     scene_seed: int = 2000
-    """Of a procedural scene."""
+    """Seed of a procedural scene."""
     image_size: str = "160x120"
-    """Of the camera, width x height."""
+    """Image size, width x height."""
     seconds: float = bounded(15.0, 0.01, 3600)
     """Length of each measurement."""
     warm_up: int = bounded(20, 0, 10_000)
-    """Steps before it: the first ones compile or load kernels."""
+    """Steps before the measurement, which compile or load kernels."""
 
     unit = "measurements"
     workers = 1
 
     def specs(self) -> list[EnvSpeedSpec]:
-        """Every combination that makes a difference."""
+        """Every distinct combination."""
         check_each("embodiment", self.embodiments, EMBODIMENTS)
         check_each("observation", self.observations, OBSERVATIONS)
         return [
@@ -84,7 +84,7 @@ class EnvSpeed(Experiment, Checked):
 
     @staticmethod
     def run(spec: EnvSpeedSpec) -> dict[str, Any]:
-        """Speed and split of one case; stages are without those nested in them."""
+        """Speed of one case, and time of each stage without nested ones."""
         has_arm = spec.embodiment not in WITHOUT_FRAMES
         env = gym.make(
             "MSActiveSLAM-v0",
@@ -102,7 +102,7 @@ class EnvSpeed(Experiment, Checked):
             env.close()
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line a case, one column a stage that took time in any."""
+        """One line per case, one column per stage that took time in any case."""
         lines, seen = [], set()
         for row in finished(rows):
             times = {one["stage"]: one["stage_ms"] for one in row["result"]["stages"]}
@@ -119,7 +119,7 @@ class EnvSpeed(Experiment, Checked):
 
 
 def _drive(env: gym.Env[Any, Any], length_s: float, warm_up: int) -> dict[str, Any]:
-    """Step at random for so long, after so many steps."""
+    """Take random steps for ``length_s`` seconds, after ``warm_up`` steps."""
     world = cast(ActiveSlamEnv, env.unwrapped)
     rng = np.random.default_rng(0)
     _, info = env.reset(seed=0)
@@ -131,7 +131,7 @@ def _drive(env: gym.Env[Any, Any], length_s: float, warm_up: int) -> dict[str, A
             begin = time.perf_counter()
         action = rng.choice(np.flatnonzero(info["action_mask"]))
         before = len(world.episode.timestamps)
-        world.timings.clear()  # what happens between steps, such as a reset, is not counted
+        world.timings.clear()  # time between steps, such as a reset, does not count
         processor, start = time.process_time(), time.perf_counter()
         _, _, terminated, truncated, info = env.step(action)
         now = time.perf_counter()

@@ -25,8 +25,8 @@ class RateSpec:
 
     Attributes:
         sequence: a folder, or scene:seed[:word[+word ...]].
-        keep_every: every so many frames are processed.
-        image_size: of the camera.
+        keep_every: process one in this many frames.
+        image_size: image size of the camera.
         frames: length of a whole rendered sequence.
         base: fields of the configuration.
     """
@@ -38,7 +38,7 @@ class RateSpec:
     base: dict[str, Any] = field(default_factory=dict)
 
     def evaluator(self) -> SlamEvaluator:
-        """What measures it."""
+        """The evaluator of the configuration."""
         return SlamEvaluator((self.sequence,), self.frames, image_size=self.image_size)
 
 
@@ -46,18 +46,18 @@ class RateSpec:
 class ExploreDivergence(Experiment):
     """Error and time at different divergences
 
-    Every n-th frame of hand-held sequences is processed, which makes the divergence between
-    processed frames larger (Saeedi et al., ICRA 2017, Figs. 3 and 5).
+    SLAM processes every n-th frame of hand-held sequences, which increases the divergence between
+    processed frames (Saeedi et al., ICRA 2017, Figs. 3 and 5).
     """
 
     sequences: tuple[str, ...] = ("living_room:1000", "corridor:1001", "table:1002", "carpet:1003")
     """Folders, or scene:seed[:word[+word ...]]."""
     keep_every: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 10)
-    """Every so many frames are processed."""
+    """Process one in this many frames."""
     config: Path | None = None
-    """Configuration file (YAML); by default the surfel backend's own."""
+    """Configuration file (YAML); by default that of the surfel backend."""
     image_size: str = "160x120"
-    """Of the camera."""
+    """Image size of the camera."""
     frames: int = 90
     """Length of a whole rendered sequence."""
 
@@ -72,7 +72,7 @@ class ExploreDivergence(Experiment):
 
     @staticmethod
     def run(spec: RateSpec) -> dict[str, Any]:
-        """Measure the configuration on what is left of the sequence."""
+        """Measure the configuration on the processed frames."""
         configuration = SlamConfiguration(**{**spec.base, "keep_every": spec.keep_every})
         evaluator = spec.evaluator()
         measured = evaluator.measure(configuration, spec.sequence)
@@ -80,7 +80,7 @@ class ExploreDivergence(Experiment):
         return {**as_metrics(measured, evaluator.clock), "failed": failed}
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line a rate."""
+        """One line per rate."""
         note = "Medians (of failures: the share) over sequences with their 95 % intervals."
         return [Grouping(("keep_every",), METRICS, count="recordings").table(rows, note=note)]
 

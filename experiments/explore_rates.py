@@ -1,4 +1,4 @@
-"""Pareto fronts at several frame rates, and so divergences: Figs. 6 and 7 of the paper."""
+"""Pareto fronts at several frame rates, and so divergences, as in Figs. 5 and 6 of the paper."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class FrontSpec:
 
     Attributes:
         base: fields of the configuration that it starts from.
-        seed: of the sampler.
+        seed: seed of the sampler.
     """
 
     keep_every: int
@@ -58,27 +58,27 @@ class FrontSpec:
 class ExploreRates(Checked, Experiment):
     """Pareto fronts at several frame rates
 
-    Every n-th frame is processed, which fixes the divergence between processed frames, and the
-    parameters are explored there (Saeedi et al., ICRA 2017, section IV-B, Figs. 6 and 7): at
-    random, as the paper does, and by a sampler that learns.
+    SLAM processes every n-th frame, which fixes the divergence between processed frames. At each
+    rate, the parameters are explored (Saeedi et al., ICRA 2017, section IV-B, Figs. 5 and 6): at
+    random, as in the paper, and by a sampler that learns.
     """
 
     keep_every: tuple[int, ...] = (1, 2, 3, 4)
-    """Every so many frames are processed; a front each."""
+    """Process one in this many frames; each value has its own front."""
     samplers: tuple[str, ...] = ("random", "tpe")
     """random, nsga2, tpe, gp, forest."""
     seeds: int = bounded(1, 1, 1000)
-    """Studies of each sampler at each rate; a front is of all their trials."""
+    """Studies of each sampler at each rate; a front contains all their trials."""
     trials: int = bounded(30, 1, 100_000)
-    """Of each study, the default first."""
+    """Trials of each study, the default configuration first."""
     sequences: tuple[str, ...] = ("living_room:1000",)
     """Folders, or scene:seed[:word[+word ...]]."""
     parameters: tuple[str, ...] = ("paper",)
-    """As of ms-slam explore; by default the paper's three."""
+    """Parameters as in ms-slam explore; by default the paper's three."""
     config: Path | None = None
     """Configuration file (YAML) to start from; by default ElasticFusion's published parameters."""
     image_size: str = "160x120"
-    """Of the camera."""
+    """Image size of the camera."""
     frames: int = 90
     """Length of a whole rendered sequence."""
 
@@ -105,7 +105,7 @@ class ExploreRates(Checked, Experiment):
 
     @staticmethod
     def run(spec: FrontSpec) -> dict[str, Any]:
-        """Explore in memory; the trials, the default first."""
+        """Explore in memory; return the trials, the default first."""
         base = SlamConfiguration(**{**spec.base, "keep_every": spec.keep_every})
         space = make_space(tuple(spec.parameters), base)
         evaluator = SlamEvaluator(tuple(spec.sequences), spec.frames, image_size=spec.image_size)
@@ -125,12 +125,12 @@ class ExploreRates(Checked, Experiment):
         return {"M_I": found[0][1].get("M_I"), "M_D": found[0][1].get("M_D"), "trials": trials}
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """The default of each rate, and what each sampler's front makes of it."""
+        """The default at each rate, and the improvements on each sampler's front."""
         lines = []
         for (every, sampler), results in _studies(rows).items():
             default = results[0]["trials"][0]
             front = front_of_trials(_trials(results))
-            error, cost = default.get(ERROR), default.get(COST)  # none where it broke down
+            error, cost = default.get(ERROR), default.get(COST)  # none if it crashed
             no_slower = [t[ERROR] for t in front if cost is not None and t[COST] <= cost]
             no_worse = [t[COST] for t in front if error is not None and t[ERROR] <= error]
             lines.append({
@@ -151,7 +151,7 @@ class ExploreRates(Checked, Experiment):
         return [make_table(columns, lines, note=note)]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """The fronts of all rates overlaid, beside their defaults; a panel for each sampler."""
+        """The fronts of all rates with their defaults, a panel per sampler."""
         drawn: dict[str, list[Series]] = {}
         for (every, sampler), results in _studies(rows).items():
             front, default = front_of_trials(_trials(results)), results[0]["trials"][0]
@@ -167,7 +167,7 @@ class ExploreRates(Checked, Experiment):
 
 
 def _series(name: str, trials: Sequence[Row], mode: str) -> Series:
-    """Error over time of some trials."""
+    """Error over time of trials."""
     x, y = ([trial[key] for trial in trials] for key in (COST, ERROR))
     return Series(name, x, y, mode=mode)
 
@@ -186,7 +186,7 @@ def _trials(results: Sequence[Row]) -> list[Row]:
 
 
 def front_of_trials(trials: Sequence[Row]) -> list[Row]:
-    """Those that none beats in error and cost, the fastest first."""
+    """Trials that none beats in error and cost, fastest first."""
     front: list[Row] = []
     for trial in sorted(trials, key=lambda t: (t[COST], t[ERROR])):
         if not front or trial[ERROR] < front[-1][ERROR]:

@@ -1,4 +1,4 @@
-"""Do samplers that learn beat random ones? Hypervolume at equal numbers of trials."""
+"""Do samplers that learn beat random sampling? Hypervolume at equal numbers of trials."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class StudySpec:
     evaluations: str
 
     def grid(self) -> Grid:
-        """The function that is explored, the same for all studies of a process."""
+        """The function to explore, the same for all studies of a process."""
         return _grid(
             tuple(self.parameters),
             SlamEvaluator(tuple(self.sequences), self.frames, image_size=self.image_size),
@@ -71,14 +71,14 @@ def _grid(
 class ExploreSamplers(Checked, Experiment):
     """Samplers of an exploration
 
-    How fast the Pareto front grows with different samplers of configurations. Each proposal is
-    moved to the nearest point of a grid, ten thousand points and more for seven parameters, and
-    what has been measured at a point is not measured again: every study of every sampler explores
-    one and the same function.
+    Compares how fast the Pareto front grows with different samplers of configurations. Each
+    proposal is moved to the nearest point of a grid (over ten thousand points for seven
+    parameters), and each point is measured only once, so that all studies explore the same
+    function.
     """
 
     samplers: tuple[str, ...] = tuple(SAMPLERS)
-    """random, nsga2, tpe, gp, forest; the first is what the others are compared with."""
+    """random, nsga2, tpe, gp, forest; the others are compared with the first."""
     seeds: int = bounded(6, 1, 1000)
     """Studies of each sampler."""
     trials: int = bounded(40, 1, 100_000)
@@ -86,17 +86,17 @@ class ExploreSamplers(Checked, Experiment):
     sequences: tuple[str, ...] = ("living_room:1000",)
     """Folders, or scene:seed[:word[+word ...]]."""
     parameters: tuple[str, ...] = PARAMETERS
-    """As of ms-slam explore, with ranges."""
+    """Parameters as in ms-slam explore, with ranges."""
     levels: int = bounded(4, 2, 1000)
-    """Points of the grid along each parameter; a range of integers may hold fewer."""
+    """Points of the grid along each parameter; a range of integers may have fewer."""
     image_size: str = "160x120"
-    """Of the camera."""
+    """Image size of the camera."""
     frames: int = 48
     """Length of a rendered sequence."""
     reference_factor: float = 2.0
-    """The hypervolume counts from so many times the default's figures."""
+    """Reference point of the hypervolume, as a multiple of the default's values."""
     evaluations: Path = Path("results/explore_samplers/evaluations.jsonl")
-    """File of what has been measured, which all studies share, later ones too."""
+    """File of measured points, shared by all studies, including later ones."""
 
     unit = rows_key = "studies"
     workers = 1  # times are measured, and points only once
@@ -131,7 +131,7 @@ class ExploreSamplers(Checked, Experiment):
         }
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line a sampler."""
+        """One line per sampler."""
         note = (
             f"Hypervolume after {self.trials // 2} and {self.trials} trials; means over the seeds "
             f"with 95 % bootstrap intervals, compared with {self.samplers[0]} at equal seeds."
@@ -142,7 +142,7 @@ class ExploreSamplers(Checked, Experiment):
                            note=note)]  # fmt: skip
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Hypervolume over trials, a line a sampler."""
+        """Hypervolume over trials, a line per sampler."""
         series = []
         for name, studies in _by_sampler(rows).items():
             values = np.array([result["hypervolume_over_trials"] for result in studies.values()])
@@ -173,9 +173,9 @@ def run_study(
 
 
 def summarise(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """A line a sampler: hypervolume, and by how much it exceeds that of the first.
+    """A line per sampler: hypervolume, and by how much it exceeds that of the first.
 
-    Intervals are of the mean over the seeds, 95 %, bootstrapped; differences are of equal seeds.
+    Intervals are 95 % bootstrap intervals of the mean over seeds; differences pair equal seeds.
     """
     samplers = _by_sampler(rows)
     first = next(iter(samplers.values()), {})

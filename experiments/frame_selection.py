@@ -1,4 +1,4 @@
-"""Active frame management against regular skipping (Saeedi et al., ICRA 2017, section V-A)."""
+"""Compare active frame management with regular skipping (Saeedi et al., ICRA 2017, V-A)."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class FilterSpec:
 class FrameSelection(Experiment, Checked):
     """Active frame management against regular skipping of as many frames
 
-    Error and map against the share of the frames that SLAM processes, on hand-held sequences with
-    quiet, walking and fast parts. Astray: a processed frame was more than 0.3 m off.
+    Compares error and map by the share of frames that SLAM processes, on hand-held sequences with
+    calm, walking and fast parts. Astray: a processed frame was more than 0.3 m off.
     """
 
     sequences: tuple[str, ...] = (
@@ -65,7 +65,7 @@ class FrameSelection(Experiment, Checked):
         "corridor:2006",
         "table:2007",
     )
-    """scene:seed (quiet, walking and fast segments), scene:seed:steady, or folders."""
+    """scene:seed (calm, walking and fast segments), scene:seed:steady, or folders."""
     managements: tuple[str, ...] = (
         "none",
         *(f"regular,every={n}" for n in (2, 3, 4)),
@@ -73,18 +73,18 @@ class FrameSelection(Experiment, Checked):
         *(f"divergence,threshold={t},reference=previous" for t in (0.001, 0.0025, 0.005, 0.01)),
         *(f"budget,share={s}" for s in (0.5, 0.33, 0.25)),
     )
-    """NAME,option=value,... as the option frame_management of an environment has them."""
+    """NAME,option=value,... as in the environment option frame_management."""
     backend: str = "surfel"
     """SLAM backend."""
     image_size: str = "160x120"
-    """Of the camera; recordings are reduced to it."""
+    """Image size of the camera; recordings are scaled down to it."""
     frames: int = bounded(300, 30, 100_000)
-    """Of a rendered sequence, 30 a second."""
+    """Number of frames of a rendered sequence, at 30 Hz."""
 
     unit = "sequences"
 
     def specs(self) -> list[FilterSpec]:
-        """One piece of work a sequence."""
+        """One spec per sequence."""
         for name in ("sequences", "managements"):
             if not getattr(self, name):
                 raise InputError(f"{name} is empty")
@@ -96,7 +96,7 @@ class FrameSelection(Experiment, Checked):
 
     @staticmethod
     def run(spec: FilterSpec) -> dict[str, Any]:
-        """Every filter; beside each that is no regular skipping, that at the filter's share."""
+        """Run every filter, and for each irregular one, regular skipping of as many frames."""
         limit_threads(1)
         path = sequences.UnevenPath(spec.frames)
         opened = sequences.open_sequence(spec.sequence, spec.image_size, path=path, with_truth=True)
@@ -119,14 +119,14 @@ class FrameSelection(Experiment, Checked):
         return {"runs": runs}
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """Medians by filter, then every filter beside regular skipping at equal share."""
+        """Medians by filter, then every filter compared with regular skipping at equal share."""
         runs = flattened(rows, "runs")
         note = f"Medians over {len({run['spec']['sequence'] for run in runs})} sequences."
         grouping = Grouping(("frame_selection",), METRICS)
         return [grouping.table(runs, note=note), _pairs(runs)]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Error, map and time over the share processed."""
+        """Error, map quality and time over the share of frames processed."""
         runs = flattened(rows, "runs")
         caption = "Small dots: sequences; line: medians; dashed: every frame."
         panels = [_panel(runs, key) for key in _PANELS]
@@ -139,9 +139,9 @@ def measure(
     """Track the sequence from its true first pose behind a filter.
 
     Args:
-        config: of the filter.
-        backend: name of the SLAM.
-        sequence: with its truth.
+        config: configuration of the filter.
+        backend: name of the SLAM backend.
+        sequence: sequence with ground truth.
         surface: (M, 3) true surface that the frames saw.
     """
     system = config.manage(slam.make(backend, sequence.intrinsics))
@@ -166,7 +166,7 @@ def measure(
 def _filter_ms(
     config: FrameSelectionConfig, sequence: sequences.Sequence, frames: list[RGBDFrame]
 ) -> float:
-    """Processor time in which the filter judges a frame."""
+    """Processor time of the filter per frame."""
     judge = config.make_filter(sequence.intrinsics)
     judge.admits(frames[0], 0, True)  # buffers grow
     begin = time.process_time()
@@ -176,7 +176,7 @@ def _filter_ms(
 
 
 def _pairs(runs: Sequence[Row]) -> Table:
-    """Each filter, regular skipping at its share, and on which share of sequences it is better."""
+    """Each filter, regular skipping at its share, and the share of sequences it is better on."""
     columns: list[Column | str] = ["frame_selection"]
     for key in (*_PAIRED, "astray", "cpu_ms_mean"):
         columns += [key, Column(f"regular_{key}", key, "regular skipping")]
@@ -198,13 +198,13 @@ def _pairs(runs: Sequence[Row]) -> Table:
 
 
 def _kind(name: str) -> str:
-    """A selection without its first option, which is what differs along a line."""
+    """Name of a filter without its first option, which varies along a line."""
     kind, _, options = name.partition(",")
     return ",".join([kind, *options.split(",")[1:]])
 
 
 def _panel(runs: Sequence[Row], key: str) -> Panel:
-    """A measure over the share processed; a dot a run, a line the medians of each kind."""
+    """A measure over the share processed: a dot per run, a line through each kind's medians."""
     by_kind: dict[str, dict[str, list[Row]]] = {}
     for run in (run["result"] for run in runs):
         name = run["frame_selection"]

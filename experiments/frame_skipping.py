@@ -1,4 +1,4 @@
-"""Experiment (c): where M_I and M_D come from, as in Figs. 3 and 4 of Saeedi et al., ICRA 2017."""
+"""Experiment (c): M_I and M_D from skipped frames, as in Fig. 3 of Saeedi et al., ICRA 2017."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class SkippingSpec:
 
     Attributes:
         scene: a scene's name or a mesh file.
-        seed: of the scene, the trajectory and the sensor noise.
-        keep_every: every so many frames one is kept; 1 keeps all, 1.5 drops one in three.
-        frames: length of the whole sequence at most.
+        seed: seed of the scene, the trajectory and the sensor noise.
+        keep_every: keep one in this many frames; 1 keeps all, 1.5 drops one in three.
+        frames: largest length of the whole sequence.
         image_size: width x height.
-        motion: ICL-NUIM's that is placed in the scene, such as ``lr_kt1``; empty: hand-held.
-        data: folder that holds it.
-        histograms: ``default`` or ``paper``, how divergence is measured.
-        backend: SLAM that runs on what is kept, with its parameters.
+        motion: motion of ICL-NUIM placed in the scene, such as ``lr_kt1``; hand-held if empty.
+        data: folder of the motion.
+        histograms: ``default`` or ``paper``, settings of the divergence.
+        backend: SLAM backend for the kept frames, with its parameters.
     """
 
     scene: str
@@ -60,13 +60,13 @@ class SkippingSpec:
 
     @property
     def kept(self) -> NDArray[np.int64]:
-        """Indices of the frames that are kept: floor(k n) for k = 0, 1, 2, ..."""
+        """Indices of the kept frames: floor(k n) for k = 0, 1, 2, ..."""
         interval = Fraction(self.keep_every).limit_denominator(_FINEST)
         count = math.ceil(self.frames / interval)
         return np.array([math.floor(k * interval) for k in range(count)], dtype=np.int64)
 
     def trajectory(self) -> Float64:
-        """Poses (N, 4, 4) of the frames that are kept."""
+        """Poses (N, 4, 4) of the kept frames."""
         scene = get_scene(self.scene, self.seed)
         if self.motion:
             poses = icl_nuim.read_motion(self.data, self.motion)[1]
@@ -83,32 +83,31 @@ class SkippingSpec:
 class FrameSkipping(Experiment):
     """Divergence against trajectory error when frames are skipped
 
-    Hand-held sequences, or ICL-NUIM's motions, of which every n-th frame is kept, or one in n
-    dropped, which makes the divergence between neighbours larger; SLAM runs on what is left. The
-    targets M_I and M_D are read at the largest interval up to which the error stays small and no
-    sequence is lost.
+    SLAM runs on every n-th frame, or on all but one in n, of hand-held sequences or of ICL-NUIM's
+    motions. Skipping frames increases the divergence between neighbours. The targets M_I and M_D
+    are read at the largest interval up to which the error stays small and no sequence is lost.
     """
 
     scenes: tuple[str, ...] = ("living_room", "corridor", "table")
     """Names of scenes, or mesh files."""
     intervals: tuple[float, ...] = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 30)
-    """Every so many frames one is kept; 1.5 drops one in three, 1.333 one in four."""
+    """Keep one in this many frames; 1.5 drops one in three, 1.333 one in four."""
     frames: int = 240
-    """Length of a whole sequence at most; hand-held, at most 1.5 cm and 1 degree a frame."""
+    """Largest length of a sequence; hand-held ones move at most 1.5 cm and 1 degree a frame."""
     motions: tuple[str, ...] = ()
-    """Motions of ICL-NUIM in place of hand-held ones, such as lr_kt1 lr_kt2."""
+    """Motions of ICL-NUIM instead of hand-held ones, such as lr_kt1 lr_kt2."""
     data: Path | None = None
-    """Folder that holds icl_nuim/trajectories/lr_kt1.tum.txt and so on."""
+    """Folder with icl_nuim/trajectories/lr_kt1.tum.txt and so on."""
     sequences: int = 4
     """Sequences for each scene."""
     seeds: str = "validation"
-    """Split that the seeds come from; a default read from them may not use the test seeds."""
+    """Split that the seeds come from; do not derive defaults from test seeds."""
     desired_ate_m: float = 0.01
     """Trajectory error for which the targets M_I and M_D are read."""
     histograms: str = "default"
     """Settings of the divergence: default, or paper (256 bins, no smoothing, every pixel)."""
     backends: tuple[str, ...] = ("surfel",)
-    """NAME, parameters appended as in surfel,check_slips=true; of several no targets are read."""
+    """NAME, parameters appended as in surfel,check_slips=true; targets need a single backend."""
 
     unit = rows_key = "sequences"
 
@@ -127,7 +126,7 @@ class FrameSkipping(Experiment):
         if self.motions and self.data is None:
             raise InputError("--motions needs --data, the folder that holds icl_nuim")
         for motion in self.motions:
-            icl_nuim.read_motion(str(self.data), motion)  # refuses what is not there
+            icl_nuim.read_motion(str(self.data), motion)  # refuses missing files
         return self.each(
             SkippingSpec,
             scene=self.scenes,
@@ -161,7 +160,7 @@ class FrameSkipping(Experiment):
         }
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line an interval, and the targets."""
+        """One line per interval, and the targets."""
         note = "Medians (of losses: the share) over sequences with their 95 % intervals."
         if self._compared:
             grouping = Grouping((*self._compared, "keep_every"), (*DIVERGENCES, "ate_m", "lost"))
@@ -190,13 +189,13 @@ class FrameSkipping(Experiment):
 
     @property
     def _compared(self) -> tuple[str, ...]:
-        """What the sequences differ in besides the interval; targets are read where in nothing."""
+        """Fields besides the interval that differ; targets are read only if there are none."""
         has = {"motion": self.motions, "backend": self.backends[1:]}
         return tuple(name for name, which in has.items() if which)
 
 
 def by_interval(rows: Sequence[Row], note: str = "") -> Table:
-    """Medians with intervals and share of lost sequences, a line an interval."""
+    """Medians with intervals, and the share of lost sequences, one line per interval."""
     keys = (*DIVERGENCES, "ate_m", "ate_tracked_m", "tracked_share", "lost")
     grouping = Grouping(("keep_every",), keys, rank_by="keep_every")
     return grouping.table(rows, note=note)
@@ -205,15 +204,15 @@ def by_interval(rows: Sequence[Row], note: str = "") -> Table:
 def suggest_targets(
     lines: Sequence[Mapping[str, Any]], desired_ate_m: float
 ) -> dict[str, float] | None:
-    """Targets from the largest interval up to which SLAM copes.
+    """Targets from the largest interval up to which SLAM still works.
 
-    At this interval, and at every smaller one, the median ATE is at most ``desired_ate_m`` and
-    no sequence is lost: a frame-to-frame SLAM error that stays small until tracking breaks makes
-    the median blind to the sequences that broke. M_I and M_D are the medians over sequences of
-    equations (11) and (12) at that interval; None if already the first interval fails.
+    At this interval, and at every smaller one, the median ATE is at most ``desired_ate_m`` and no
+    sequence is lost. The second condition is needed because the error stays small until tracking
+    breaks, so that the median does not show the sequences that broke. M_I and M_D are the medians
+    over sequences of equations (11) and (12) at that interval; None if the first interval fails.
 
     Args:
-        lines: of :func:`by_interval`, in the order of the intervals.
+        lines: result of :func:`by_interval`, in the order of the intervals.
         desired_ate_m: largest median ATE.
     """
     best: Mapping[str, Any] | None = None

@@ -1,4 +1,4 @@
-"""Does every dwelling build without fault, and how long does it take?"""
+"""Does every generated home build without faults, and how long does it take?"""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from ms_slam_env.scenes.mesh_queries import face_cross, sample_surface
 _TRIANGLES = (60_000, 320_000)
 _VOXEL_M = 0.1
 _CAMERA_M = 0.1
-_FREE_SHARE = 0.2  # of a room's volume that a camera gets to, at least
+_FREE_SHARE = 0.2  # least share of a room's volume that a camera can reach
 _SEEDS = (*SEED_SPLITS["test"], *SEED_SPLITS["validation"], *SEED_SPLITS["train"])
 
 
 @dataclass(frozen=True)
 class HomeSpec:
-    """One dwelling; ``lit``: with its light, and loaded again as from the cache."""
+    """One home; if ``lit``, its light is computed too, and it is loaded again as from the cache."""
 
     seed: int
     lit: bool
@@ -44,29 +44,29 @@ class HomeSpec:
 class Homes(Checked, Experiment):
     """Dwellings that were built
 
-    Every dwelling is built and looked at for faults: the number of rooms and their area, doors that
-    lead to every room, furniture in doorways or in other furniture, values that are not finite and
-    triangles without area, the number of triangles, and free space that a camera gets to through
-    the doors, by flood fill. Some are lit and kept, too. Times are of the processor.
+    Builds every home and checks it for faults: number and area of rooms, doors to every room,
+    furniture in doorways or in other furniture, values that are not finite, triangles without area,
+    number of triangles, and free space that a camera can reach through the doors, by flood fill.
+    Some homes are also lit and stored. Times are processor times.
     """
 
     homes: int = bounded(1000, 1, len(_SEEDS))
-    """Dwellings: the seeds of test, validation and training, in this order."""
+    """Number of homes: the seeds of test, validation and training, in this order."""
     lit_every: int = bounded(50, 1, 10_000)
-    """Every so many are lit, too."""
+    """Light one in this many homes, too."""
 
     unit = "homes"
     workers = 1
 
     def specs(self) -> list[HomeSpec]:
-        """One a seed."""
+        """One spec per seed."""
         return [
             HomeSpec(seed, k % self.lit_every == 0) for k, seed in enumerate(_SEEDS[: self.homes])
         ]
 
     @staticmethod
     def run(spec: HomeSpec) -> dict[str, Any]:
-        """Build it, look for faults, and light it where asked for."""
+        """Build a home, check it for faults, and light it if requested."""
         start = time.process_time()
         plan, build, rooms, _ = built(spec.seed)
         geometry = build.build()
@@ -88,7 +88,7 @@ class Homes(Checked, Experiment):
         return found
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """How many were built, how many had faults, and the distribution of times and sizes."""
+        """Numbers of homes built and with faults, and distributions of times and sizes."""
         done = [row["result"] for row in finished(rows)]
         faulty = [row for row in finished(rows) if row["result"]["faults"]]
         counts = {"homes": len(rows), "built_homes": len(done), "faulty_homes": len(faulty)}
@@ -119,7 +119,7 @@ _DISTRIBUTED = (
 
 
 def plan_faults(plan: FloorPlan) -> list[str]:
-    """Too few or many rooms, too small or large, or rooms that no door leads to."""
+    """Faults of a plan: too few or many rooms, too small or large ones, or rooms without access."""
     found = []
     if not ROOMS_M[0] <= len(plan.rooms) - 1 <= ROOMS_M[1]:
         found.append(f"{len(plan.rooms) - 1} rooms")
@@ -133,7 +133,7 @@ def plan_faults(plan: FloorPlan) -> list[str]:
 
 
 def room_faults(rooms: Sequence[Furnisher]) -> list[str]:
-    """Furniture that stands in other furniture, in a doorway or beyond a wall."""
+    """Faults of rooms: furniture in other furniture, in a doorway or beyond a wall."""
     found = []
     for of in rooms:
         wall = np.array(of.room.size[:2]) + 1e-6
@@ -149,7 +149,7 @@ def room_faults(rooms: Sequence[Furnisher]) -> list[str]:
 
 
 def mesh_faults(plan: FloorPlan, geometry: Geometry) -> list[str]:
-    """Values that are not finite, triangles without area or too many, rooms that are shut."""
+    """Faults of a mesh: values not finite, triangles without area or too many, closed rooms."""
     found = []
     if not (np.isfinite(geometry.vertices).all() and np.isfinite(geometry.uv).all()):
         found.append("values that are not finite")
@@ -162,7 +162,7 @@ def mesh_faults(plan: FloorPlan, geometry: Geometry) -> list[str]:
 
 
 def shut_rooms(plan: FloorPlan, geometry: Geometry) -> list[str]:
-    """Rooms of which a camera from the hall gets to less than ``_FREE_SHARE``, by flood fill."""
+    """Rooms of which a camera from the hall reaches less than ``_FREE_SHARE``, by flood fill."""
     points, _ = sample_surface(geometry.vertices, geometry.faces, 0.4 * _VOXEL_M)
     hall = np.array([*np.add(plan.rooms[-1].low, plan.rooms[-1].high) / 2, 1.3])
     free = FreeSpace(points, Holding(hall[None]), _VOXEL_M)

@@ -1,4 +1,4 @@
-"""Kullback-Leibler against earth mover's distance: which takes a change of light for a motion?"""
+"""Kullback-Leibler or earth mover's distance: which one mistakes a change of light for motion?"""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class LightSpec:
 class LightTolerance(Experiment, Checked):
     """Divergence of a change of light in units of that of a motion
 
-    The paper hopes of the earth mover's distance for "tolerance to small illumination changes".
-    A frame is compared with itself in other light (exposure: linear light times a gain; a lamp:
-    grey levels plus an offset), and with the frame before, in the same light. Below 100 % a
-    measure takes the change of light for less than the median motion.
+    The paper expects the earth mover's distance to give "tolerance to small illumination changes".
+    Each frame is compared with itself in other light (exposure: linear light times a gain; a lamp:
+    grey levels plus an offset), and with the frame before in the same light. Below 100 %, the
+    change of light has a smaller effect than the median motion.
     """
 
     scenes: tuple[str, ...] = PUBLISHED_ROOMS
@@ -50,9 +50,9 @@ class LightTolerance(Experiment, Checked):
     gains: tuple[float, ...] = (1.02, 1.05, 1.1, 1.3)
     """Factors of the exposure."""
     offsets: tuple[float, ...] = (2.0, 5.0, 10.0)
-    """Grey levels that are added."""
+    """Grey levels to add."""
     frames: int = bounded(60, 2, 100_000)
-    """Of each path, at 30 Hz."""
+    """Number of frames of each path, at 30 Hz."""
     every: int = bounded(1, 1, 1000)
     """Take every n-th frame of it."""
     seeds: str = "validation"
@@ -61,7 +61,7 @@ class LightTolerance(Experiment, Checked):
     unit = "sequences"
 
     def specs(self) -> list[LightSpec]:
-        """One piece of work a scene.
+        """One spec per scene.
 
         Raises:
             InputError: a gain that is not positive, or nothing that changes the light.
@@ -104,7 +104,7 @@ class LightTolerance(Experiment, Checked):
 
 
 def relit(frame: RGBDFrame, gain: float, offset: float) -> RGBDFrame:
-    """A frame whose linear light is ``gain`` times as strong, ``offset`` grey levels brighter."""
+    """The frame with its linear light multiplied by ``gain``, plus ``offset`` grey levels."""
     shade = 255.0 * np.clip(gain * (frame.color / 255.0) ** GAMMA, 0, 1) ** (1 / GAMMA)
     color = np.clip(np.round(shade + offset), 0, 255).astype(np.uint8)
     return replace(frame, color=color)

@@ -1,8 +1,8 @@
 """How well does the divergence predicted from the map rank the 49 motions?
 
-At states along hand-held paths, SLAM's map predicts the divergence of every candidate motion; then
-each candidate is really made, its noisy frame rendered and its divergence measured. The ranking of
-a state is judged by Spearman's rank correlation of the two over the candidates.
+At states along hand-held paths, the divergence of every candidate motion is predicted from SLAM's
+map. Then each motion is executed, its noisy frame rendered, and its divergence measured. The
+quality of a state's ranking is Spearman's rank correlation of the two over the candidates.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from ms_slam_env.sequences import handheld_trajectory
 
 WARM_UP_FRAMES = 12  # before the first state, so that there is a map
 FRAMES_BETWEEN_STATES = 6
-PATH_SPEED_M, PATH_SPEED_DEG = 0.03, 2.0  # as a planner that keeps tracking moves
+PATH_SPEED_M, PATH_SPEED_DEG = 0.03, 2.0  # like a planner that keeps tracking
 FIRST_TRIAL_FRAME = 1_000_000  # noise counter of the candidates' frames, far from the path's
 KINDS = ("intensity", "depth")
 JUDGED = ("rank_correlation", "divergence_floor", "divergence_met")
-AIMS = {"intensity": 0.7, "depth": 0.8}  # rank correlations that were aimed at
+AIMS = {"intensity": 0.7, "depth": 0.8}  # rank correlations to reach
 
 _MEASURES = {
     "default, all pixels": DivergenceConfig(intensity_pixels="all"),
@@ -68,7 +68,7 @@ SETTINGS: dict[str, tuple[DivergenceConfig, LookaheadConfig]] = {
     "default, predicted at full size": (DivergenceConfig(), LookaheadConfig(scale=1.0)),
     **{name: (measure, LookaheadConfig()) for name, measure in _MEASURES.items()},
 }
-"""Name to (how divergence is measured, how candidates are predicted)."""
+"""Name to settings of the divergence and of the lookahead."""
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ class RankingSpec:
 class LookaheadRanking(Experiment):
     """Rank correlation of predicted and met divergence over the 49 motions
 
-    How well the map tells, before a motion is made, what it will show; by how divergence is
-    measured and predicted.
+    Measures how well the map predicts the divergence of a motion before it is made, for several
+    settings of divergence and lookahead.
     """
 
     scenes: tuple[str, ...] = PUBLISHED_ROOMS
     """Names of scenes, or mesh files."""
     seeds: str = "validation"
-    """Split that the seeds come from; the defaults read from the result may not use test seeds."""
+    """Split that the seeds come from; do not derive defaults from test seeds."""
     paths: int = 1
     """Seeds for each scene."""
     states: int = 20
@@ -113,8 +113,9 @@ class LookaheadRanking(Experiment):
         """Judge every setting at every state of one path.
 
         Returns:
-            ``states`` (used), ``lost_states`` (left out, tracking was lost) and ``predictions``:
-            by state and setting (``variant``) what ``JUDGED`` names of intensity and depth.
+            ``states`` (used), ``lost_states`` (left out because tracking was lost) and
+            ``predictions``: the measures in ``JUDGED``, for intensity and depth, by state and
+            setting (``variant``).
         """
         scene = get_scene(spec.scene, spec.seed)
         camera = xtion(spec.image_size)
@@ -139,7 +140,7 @@ class LookaheadRanking(Experiment):
                 continue
             pose, estimate = path[step.index], step.result.T_world_camera
             possible = _free_motions(scene, pose, motions)
-            # Candidates, and two more frames from where the camera is for the sampling floor.
+            # Candidates, and two more frames from the current pose for the noise floor.
             trials = np.concatenate([pose @ possible, pose[None], pose[None]])
             counters = FIRST_TRIAL_FRAME + 100 * step.index + np.arange(len(trials))
             met_frames = sensor.capture_batch(trials, counters)
@@ -156,7 +157,7 @@ class LookaheadRanking(Experiment):
         return self.each(RankingSpec, scene=self.scenes, seed=seed_list(self.seeds, self.paths))
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line a setting, over the states of all paths."""
+        """One line per setting, over the states of all paths."""
         columns = [f"{name}_{kind}" for kind in KINDS for name in JUDGED]
         lines: list[dict[str, Any]] = []
         for variant, states in by_variant(rows).items():
@@ -192,7 +193,7 @@ class LookaheadRanking(Experiment):
 
 
 def by_variant(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """The states of all paths by setting, those of a setting without states left out."""
+    """States of all paths by setting; settings without states are left out."""
     found: dict[str, list[Row]] = {}
     for row in finished(rows):
         for state in row["result"]["predictions"]:
@@ -201,7 +202,7 @@ def by_variant(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def _free_motions(scene: Scene, pose: Float64, motions: Float64) -> Float64:
-    """The motions (n, 4, 4) that nothing blocks."""
+    """The motions (n, 4, 4) that are not blocked."""
     targets = (pose @ motions)[:, :3, 3]
     free = [scene.segment_is_free(pose[:3, 3], target, CAMERA_RADIUS_M) for target in targets]
     free[:NUM_ROTATIONS] = [True] * NUM_ROTATIONS  # turning on the spot is always possible
@@ -217,7 +218,7 @@ def _met_divergences(measure: Divergence, frames: Sequence[RGBDFrame], live: RGB
 
 
 def _judge(predicted: Float64, met: Float64, still: Float64) -> dict[str, float]:
-    """Divergences (n, 2) predicted and met by the candidates, and (m, 2) of who stands still."""
+    """Measures from predicted and measured divergences (n, 2), and those at rest (m, 2)."""
     pairs = rank_correlations(predicted, met), still.mean(axis=0), np.median(met, axis=0)
     return {
         f"{name}_{kind}": float(pair[k])

@@ -1,4 +1,4 @@
-"""Time of the lookahead: 49 predicted views and their divergences, from a map of given size."""
+"""Measure the time of the lookahead: 49 predicted views and divergences, for a given map size."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ STAGES = {
     "histograms": ("counting.py", "histograms"),
     "divergences": ("measures.py", "divergence"),
 }
-"""Stage to (file, function), with its callees but for the copy to the host."""
+"""Stage to (file, function); its time includes callees, except the copy to the host."""
 
 
 @dataclass(frozen=True)
@@ -58,20 +58,20 @@ class LookaheadSpec:
 class LookaheadSpeed(Experiment, Checked):
     """Time of the lookahead and of its parts
 
-    49 candidates are predicted from the map of a noisy hand-held trajectory and compared with the
-    present view. The parts are profiled, which makes short ones look dear.
+    Predicts 49 candidates from the map of a noisy hand-held trajectory, and compares them with the
+    current view. The parts are profiled, which exaggerates the cost of short ones.
     """
 
     scene: str = "living_room"
-    """Where the map is made."""
+    """Scene to map."""
     seed: int = 0
-    """Of scene, trajectory and noise."""
+    """Seed of scene, trajectory and noise."""
     size: str = "160x120"
-    """Of the live camera."""
+    """Image size of the live camera."""
     surfels: int = bounded(50_000, 1000, 190_000)
-    """Size of the map, at least."""
+    """Smallest number of surfels in the map."""
     scale: float = bounded(LookaheadConfig().scale, 0.1, 1.0)
-    """Of the predicted images."""
+    """Scale of the predicted images."""
     step_m: float = EnvConfig.step_m
     """Translation of the candidates."""
     step_deg: float = round(float(np.degrees(EnvConfig.step_rad)), 6)
@@ -114,7 +114,7 @@ class LookaheadSpeed(Experiment, Checked):
         }
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line a part."""
+        """One line per part."""
         columns = ("stage", "stage_ms", "stage_ms_p90", "stage_cpu_ms")
         return [
             make_table(
@@ -130,7 +130,7 @@ def build_map(spec: LookaheadSpec) -> tuple[SurfelSlam, RGBDFrame]:
     """Run SLAM on a noisy hand-held trajectory until its map is large enough.
 
     Raises:
-        InputError: the scene does not fill so large a map.
+        InputError: the scene is too small for a map of this size.
     """
     scene = scenes.make(spec.scene, seed=spec.seed)
     intrinsics = xtion(spec.size)
@@ -164,7 +164,7 @@ def _milliseconds(call: Callable[[], object], repeats: int) -> dict[str, float]:
 
 
 def _profile(call: Callable[[], object], repeats: int) -> list[dict[str, Any]]:
-    """Milliseconds a call of each stage."""
+    """Milliseconds per call of each stage."""
     profiler = cProfile.Profile()
     profiler.enable()
     for _ in range(repeats):

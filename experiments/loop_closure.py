@@ -1,4 +1,4 @@
-"""What loop closure does for trajectory and map, on rendered recordings that come back.
+"""Effect of loop closure on trajectory and map, on rendered recordings that return to a place.
 
 Each is run twice, with loop closure and without.
 """
@@ -56,10 +56,10 @@ TRACKED = ("ate_tracked_m", "tracked_share")
 GAPS = ("before_m", "after_m")  # between new and old map
 NOISES: dict[str, str | sensor.NoiseConfig] = {
     "kinect": "kinect",
-    "coarse": sensor.NoiseConfig(axial=2.0, lateral=1.5),  # times that of a Kinect
+    "coarse": sensor.NoiseConfig(axial=2.0, lateral=1.5),  # multiples of a Kinect's noise
 }
 _WARM_UP = 5  # frames left out of the timing
-WRONG_M = 0.05  # a closure is wrong if it leaves new and old map further apart than this
+WRONG_M = 0.05  # a closure is wrong if new and old map remain farther apart
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,13 @@ class LoopSpec:
 
     Attributes:
         scene: name of the scene, or a mesh file.
-        seed: of the scene, the path and the noise.
+        seed: seed of the scene, the path and the noise.
         path: one of ``PATHS``.
         step_m, step_deg: largest motion between frames.
         noise: one of ``NOISES``.
         closure: variant of loop closure.
-        options: parameters of the SLAM.
-        picture: where a picture of the first closure goes; empty for none.
+        options: parameters of SLAM.
+        picture: file for a picture of the first closure; none if empty.
     """
 
     scene: str
@@ -89,7 +89,7 @@ class LoopSpec:
     picture: str = ""
 
     def name(self) -> str:
-        """Of the recording."""
+        """Name of the recording."""
         pace = f"{100 * self.step_m:g} cm {self.step_deg:g} deg"
         return f"{Path(self.scene).stem}:{self.seed} {self.path}, {pace}, {self.noise}"
 
@@ -98,16 +98,16 @@ class LoopSpec:
 class LoopClosure(Experiment):
     """Recordings that come back to their start, with loop closure and without
 
-    Loop closure bends the map where the camera sees a part again that has drifted away; the two
-    parts then lie on each other.
+    When the camera sees a part again that has drifted away, loop closure deforms the map so that
+    both parts coincide.
     """
 
     recordings: tuple[str, ...] = DEFAULT_RECORDINGS
-    """scene:seed:path:step_m:step_deg:noise each; the scene may be a mesh file."""
+    """scene:seed:path:step_m:step_deg:noise for each; the scene may be a mesh file."""
     sizes: tuple[str, ...] = ("160x120", "320x240")
     """Image sizes."""
     options: tuple[str, ...] = ()
-    """Parameters of the SLAM, as in loops.window=100."""
+    """Parameters of SLAM, as in loops.window=100."""
     pictures: Path | None = None
     """Folder of pictures of the maps where loops closed; none by default."""
 
@@ -115,7 +115,7 @@ class LoopClosure(Experiment):
 
     @staticmethod
     def run(spec: LoopSpec) -> dict[str, Any]:
-        """Run one recording through the SLAM."""
+        """Run SLAM on one recording."""
         scene = scenes.make(spec.scene, spec.seed)
         truth = returning_path(scene, spec.path, spec.seed, spec.step_m, spec.step_deg)
         camera = xtion(spec.size)
@@ -138,7 +138,7 @@ class LoopClosure(Experiment):
             estimate[k] = result.T_world_camera
             tracked.append(result.tracking_ok)
             if result.loop_closed:
-                # Without the closure the camera had gone on as it truly did.
+                # Without the closure, the pose would have followed the true motion.
                 unclosed = previous @ invert(truth[k - 1]) @ truth[k]
                 window = config.loops.window
                 closures.append(judge_closure(k, past, truth, unclosed, estimate[k], window))
@@ -175,7 +175,7 @@ class LoopClosure(Experiment):
     def specs(self) -> list[LoopSpec]:
         """Every run."""
         options = nested_options(self.options)
-        from_dict(SurfelConfig, options, "options")  # refuse bad ones before anything runs
+        from_dict(SurfelConfig, options, "options")  # refuse invalid ones before any run
         return [
             LoopSpec(*_parse(text), size, closure, options, shown if closure != "none" else "")
             for size in self.sizes
@@ -185,7 +185,7 @@ class LoopClosure(Experiment):
         ]
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line a run, and medians over the recordings that both variants finished."""
+        """One line per run, and medians over the recordings that both variants finished."""
         lines: list[dict[str, Any]] = [
             {"sequence": LoopSpec(**row["spec"]).name(), "image_size": row["spec"]["size"],
              "loop_closure": row["spec"]["closure"], **_medians(row["result"]["closures"], GAPS),
@@ -219,7 +219,7 @@ class LoopClosure(Experiment):
 
 
 def pairs_of(rows: Sequence[Row]) -> list[dict[str, Row]]:
-    """Results by variant, of the recordings that both variants finished."""
+    """Results by variant, for the recordings that both variants finished."""
     results: dict[str, dict[str, Row]] = {}
     for row in finished(rows):
         spec = LoopSpec(**row["spec"])
@@ -236,7 +236,7 @@ def _parse(text: str) -> tuple[str, int, str, float, float, str]:
     """Parts of a recording's name.
 
     Raises:
-        InputError: another number of parts, no numbers, an unknown path or noise.
+        InputError: wrong number of parts, invalid numbers, an unknown path or noise.
     """
     parts = text.rsplit(":", 5)
     if len(parts) != 6:
@@ -252,9 +252,9 @@ def _parse(text: str) -> tuple[str, int, str, float, float, str]:
 
 
 BAND_M = (0.9, 1.5)  # heights shown: walls and furniture, neither floor nor ceiling
-NEW_FRAMES = 40  # surfels younger than this are the present part
-CELL_M = 0.2  # places compared for how much of both parts they show
-ZOOM_M = 0.1  # half of what the lower row shows
+NEW_FRAMES = 40  # surfels younger than this belong to the new part
+CELL_M = 0.2  # size of the places compared for how many surfels of both parts they contain
+ZOOM_M = 0.1  # half the width of the lower row's detail
 _COLOURS = {"old": "#3366bb", "new": "#cc3311", "true": "#bbbbbb"}
 
 
@@ -277,7 +277,7 @@ def map_view(system: BatchedSurfelSlam, frame: int) -> MapView:
 def save_picture(
     views: tuple[MapView, MapView], scene: Scene, T_world_camera: Float64, path: Path, title: str
 ) -> Path:
-    """Draw both maps within a band of heights; the lower row shows a part in view, enlarged."""
+    """Draw both maps within a band of heights; the lower row enlarges a part in view."""
     surface = _band(scene.surface_points(0.01)[0])
     centre = _joined_part(views[0], T_world_camera)
     figure = new_figure(2, width=5.2, height=9.0)
@@ -313,7 +313,7 @@ def _band(points: Float64) -> Float64:
 
 
 def _joined_part(view: MapView, pose: Float64) -> Float64:
-    """Middle (2,) of the place, in view, with most old and new surfels together."""
+    """Centre (2,) of the place in view with the most old and new surfels together."""
     camera = (view.points - pose[:3, 3]) @ pose[:3, :3]
     u, v = camera[:, 0] / camera[:, 2], camera[:, 1] / camera[:, 2]
     seen = (camera[:, 2] > 0.3) & (np.abs(u) < 0.5) & (np.abs(v) < 0.4) & _in_band(view.points)
@@ -326,7 +326,7 @@ def _joined_part(view: MapView, pose: Float64) -> Float64:
 
 @dataclass(frozen=True)
 class Closure:
-    """One closed loop: how far new and old map were apart before and after, and when."""
+    """One loop closure: distances between new and old map before and after, and the frame."""
 
     frame: int
     before_m: float
@@ -336,7 +336,7 @@ class Closure:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether they do not fit after it."""
+        """Whether new and old map do not fit afterwards."""
         return self.after_m > WRONG_M or self.after_deg > WRONG_DEG
 
 
@@ -348,9 +348,9 @@ def judge_closure(
     closed: Float64,
     window: int,
 ) -> Closure:
-    """Compare the poses before and after a closure with where the old map says the camera is.
+    """Compare the poses before and after a closure with the pose that the old map implies.
 
-    That is the true motion from the nearest old frame, applied to its estimate.
+    That pose is the true motion from the nearest old frame, applied to that frame's estimate.
     """
     frames, poses = past
     old = frames < frame - window

@@ -1,4 +1,4 @@
-"""Does SLAM keep its pose, and know what moves, where boxes and people move about?"""
+"""Does SLAM keep its pose, and recognise what moves, among moving boxes and people?"""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ DEFAULT_SEQUENCES = (
     f"table:2013:{_BOXES}=2",
     *("living_room:2014", "corridor:2016", "table:2017", "carpet:2018"),
 )
-"""Rooms in which boxes or people move, and some in which nothing does."""
+"""Rooms with moving boxes or people, and some in which nothing moves."""
 KEYS = (
     *("lost_share", "ate_m", "ate_max_m", "ate_tracked_m", "tracked_share"),
     *("mask_precision", "mask_recall", "mask_iou", "mask_false_share", "cpu_ms_median"),
@@ -45,7 +45,7 @@ _SHOWN, _PER_ROW = 12, 6  # frames of the picture
 
 @dataclass(frozen=True)
 class MovingObjectsSpec:
-    """A sequence and what runs over it; see :class:`MovingObjectsExperiment` for the fields."""
+    """A sequence with its backends; see :class:`MovingObjectsExperiment` for the fields."""
 
     sequence: str
     backends: tuple[str, ...]
@@ -57,8 +57,9 @@ class MovingObjectsSpec:
 class MovingObjectsExperiment(Experiment, Checked):
     """Moving boxes and people: pose, and mask against the renderer's labels
 
-    Every backend runs over the same frames from the true first pose. A mask is judged on the pixels
-    with depth; a thing that can move counts as moving also while it turns on the spot.
+    Every backend runs over the same frames from the true first pose. Masks are evaluated on the
+    pixels with depth; a moving object also counts as moving while it stands still or turns on the
+    spot.
     """
 
     sequences: tuple[str, ...] = DEFAULT_SEQUENCES
@@ -66,15 +67,15 @@ class MovingObjectsExperiment(Experiment, Checked):
     backends: tuple[str, ...] = ("surfel", MASKED, "sparse", "volumetric")
     """NAME, parameters appended as in surfel,motion_mask=geometric."""
     image_size: str = "160x120"
-    """Such as 160x120."""
+    """Image size, such as 160x120."""
     frames: int = bounded(300, 10, 100_000)
-    """Of a sequence."""
+    """Number of frames of a sequence."""
 
     unit = "sequences"
     workers = 1
 
     def __post_init__(self) -> None:
-        """Refuse what no run could use."""
+        """Refuse settings that no run could use."""
         super().__post_init__()
         for text in self.sequences:
             if Path(text).is_dir():
@@ -86,7 +87,7 @@ class MovingObjectsExperiment(Experiment, Checked):
 
     @staticmethod
     def run(spec: MovingObjectsSpec) -> dict[str, Any]:
-        """Let every backend track the frames, rendered once."""
+        """Run every backend over the frames, rendered once."""
         sequence = _rendered(spec)
         frames, true = list(sequence.frames), true_masks(sequence.frames)
         is_read = np.array([frame.depth > 0 for frame in frames])
@@ -113,7 +114,7 @@ class MovingObjectsExperiment(Experiment, Checked):
         return {"moving_share": share, "path_m": path_m, "runs": runs}
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """Medians where something moves and where nothing does, then every run."""
+        """Medians with and without motion, then every run."""
         lines = _lines(rows)
         keys = [key for key in KEYS if any(key in line for line in lines)]
         medians = []
@@ -134,7 +135,7 @@ class MovingObjectsExperiment(Experiment, Checked):
         ]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Error against processor time, a mark for each sequence in which something moves."""
+        """Error against processor time, a mark for each sequence with moving objects."""
         points = [
             cast(Row, {"spec": {"backend": line["backend"]}, "result": line, "error": None})
             for line in _lines(rows)
@@ -145,7 +146,7 @@ class MovingObjectsExperiment(Experiment, Checked):
         return [Chart("moving_objects", "Error against time", caption, [panel])]
 
     def write_pictures(self, rows: Sequence[Row], out: Path) -> None:
-        """The mask on frames of the sequence in which most moves."""
+        """The mask on frames of the sequence with the most motion."""
         from ms_slam_experiments.pictures.stills import save_image
 
         moving = [row for row in finished(rows) if row["result"]["moving_share"] > 0]
@@ -177,7 +178,7 @@ def _lines(rows: Sequence[Row]) -> list[Mapping[str, Any]]:
 
 
 def _picture(sequence: sequences.RenderedSequence) -> np.ndarray:
-    """Frames with what was found in red, found wrongly in yellow and missed in blue."""
+    """Frames with masked pixels in red, wrongly masked ones in yellow and missed ones in blue."""
     import cv2
 
     name, params = parse_named(MASKED, "backend")
@@ -202,7 +203,7 @@ def _picture(sequence: sequences.RenderedSequence) -> np.ndarray:
 
 
 def true_masks(frames: RenderedFrames) -> Bool:
-    """Where (N, H, W) a moving object is in each frame, also while it stands still."""
+    """Masks (N, H, W) of the moving objects in each frame, also while they stand still."""
     movers = tuple(frames.object_trajectories)
     moving = [
         index
@@ -213,7 +214,7 @@ def true_masks(frames: RenderedFrames) -> Bool:
 
 
 def found_masks(results: Sequence[TrackResult], shape: tuple[int, int]) -> Bool | None:
-    """The masks (N, H, W) that SLAM found; None if it looks for none, empty where it was lost."""
+    """The masks (N, H, W) found by SLAM; None if it computes none, all False where it was lost."""
     known = [result.moving for result in results if result.moving is not None]
     if not known:
         return None
@@ -228,9 +229,9 @@ def found_masks(results: Sequence[TrackResult], shape: tuple[int, int]) -> Bool 
 
 
 def mask_measures(found: Bool, true: Bool, is_read: Bool) -> dict[str, float | None]:
-    """Precision, recall, overlap and false share of masks (N, H, W), of the pixels with depth.
+    """Precision, recall, IoU and false share of masks (N, H, W), over the pixels with depth.
 
-    None where nothing is there to be found.
+    Precision, recall and IoU are None if nothing moves.
     """
     found, true = found & is_read, true & is_read
     both, either = int((found & true).sum()), int((found | true).sum())

@@ -1,4 +1,4 @@
-"""Two or three robots, each with a SLAM of its own, their maps merged into one frame."""
+"""Merge the maps of two or three robots, each with its own SLAM, into one frame."""
 
 from __future__ import annotations
 
@@ -50,15 +50,15 @@ SHARED, FOREIGN = "shared", "foreign"
 SETTINGS = (SHARED, FOREIGN)
 """All robots in one scene; or the last one in another scene of the same kind."""
 
-WRONG_M, WRONG_DEG = 0.10, 5.0  # a merge that is off by more is wrong
+WRONG_M, WRONG_DEG = 0.10, 5.0  # a merge with a larger error is wrong
 _OTHER_SEED = 50_000
 _SURFACE_M = 0.01
-_LOOK_EVERY = 5  # frames between views that the surface to be mapped is made of
+_LOOK_EVERY = 5  # frames between the views that define the surface to map
 
 VOXEL_M = 0.10
 _ATTEMPTS = 30
 _SEEDS_A_ROBOT = 1000
-_LOOKS = 25  # poses of a path that are looked from
+_LOOKS = 25  # poses of a path from which views are taken
 _REACH_M = 4.0  # of the sensor
 
 
@@ -68,16 +68,16 @@ class MultiRobotSpec:
 
     Attributes:
         scene: name or mesh file.
-        seed: of the scene, the paths and the noise.
-        robots: how many, 2 or 3.
+        seed: seed of the scene, the paths and the noise.
+        robots: number of robots, 2 or 3.
         setting: one of ``SETTINGS``.
-        frames: of each robot.
+        frames: number of frames of each robot.
         image_size: such as 160x120.
-        noise: of the sensors.
-        least_overlap: of the surfaces that they see.
-        params: of the SLAM.
-        merge: how maps are merged.
-        server: whether trajectories and map are optimised after merging, too.
+        noise: noise of the sensors.
+        least_overlap: smallest overlap of the surfaces that they see.
+        params: parameters of SLAM.
+        merge: how to merge maps.
+        server: whether to optimise trajectories and map after merging, too.
     """
 
     scene: str = "living_room"
@@ -103,7 +103,7 @@ class Team:
         times: M time stamps (N,), seconds.
         surface: (P, 3) points of the whole scene's surface, world frame.
         seen: (Q, 3) points of the surface that the true trajectories saw.
-        overlaps: of every robot but the first with one before.
+        overlaps: largest overlap of every robot but the first with an earlier one.
     """
 
     robots: list[RobotRun]
@@ -119,7 +119,7 @@ class Team:
 
 
 def make_team(spec: MultiRobotSpec) -> Team:
-    """Render what each robot sees and let its SLAM map it.
+    """Render the frames of each robot and map them with its SLAM.
 
     Raises:
         InputError: a scene, size, noise or parameter that does not exist, or no paths.
@@ -150,10 +150,10 @@ def make_team(spec: MultiRobotSpec) -> Team:
 
 
 class Views:
-    """Which surface a path sees, as occupied voxels of ``VOXEL_M``."""
+    """Surface seen from a path, as occupied voxels of ``VOXEL_M``."""
 
     def __init__(self, scene: Scene) -> None:
-        """Prepare to look around in a scene."""
+        """Prepare to render views of a scene."""
         self._sensor = RGBDSensor(scene, xtion("80x60"), noise="none")
 
     def of(self, poses: Float64) -> set[tuple[int, ...]]:
@@ -162,7 +162,7 @@ class Views:
         return set(map(tuple, np.floor(points / VOXEL_M).astype(int).tolist()))
 
     def points(self, poses: Float64, voxel_m: float) -> Float64:
-        """Points (M, 3) of the true surface that poses (N, 4, 4) see, one a voxel."""
+        """Points (M, 3) of the true surface seen from poses (N, 4, 4), one per voxel."""
         seen = []
         for pose in poses:
             view = self._sensor.ground_truth(pose)
@@ -172,21 +172,21 @@ class Views:
 
 
 def overlap(a: set[tuple[int, ...]], b: set[tuple[int, ...]]) -> float:
-    """Share of the smaller of two sets of voxels that is in the other too."""
+    """Share of the smaller of two sets of voxels that is also in the other."""
     return len(a & b) / max(1, min(len(a), len(b)))
 
 
 def team_paths(
     scene: Scene, path: HandheldPath, seed: int, robots: int, least_overlap: float
 ) -> tuple[list[Float64], list[float]]:
-    """A path for each robot, each seeing enough of what one before it sees.
+    """A path for each robot that sees enough of the surface that an earlier robot sees.
 
     Args:
-        scene: where.
-        path: how they are carried.
-        seed: of the paths.
-        robots: how many.
-        least_overlap: share of the smaller set of surfaces seen, [0, 1]; 0 = any path will do.
+        scene: scene of the paths.
+        path: kind of path.
+        seed: seed of the paths.
+        robots: number of robots.
+        least_overlap: share of the smaller surface seen, [0, 1]; 0 accepts any path.
 
     Returns:
         paths (N, 4, 4), and for every robot but the first its largest overlap with one before.
@@ -219,7 +219,7 @@ def team_paths(
 
 @dataclass(frozen=True)
 class PairMerge:
-    """What came of merging two maps, from all guesses and from those of each source alone."""
+    """Result of merging two maps, with all hypotheses and with those of each source alone."""
 
     merge: Merge
     alone: dict[str, Merge] = field(default_factory=dict)
@@ -241,9 +241,9 @@ def merge_pairs(robots: list[RobotRun], config: MergeConfig) -> dict[tuple[int, 
 
 
 def place_robots(count: int, merges: dict[tuple[int, int], PairMerge]) -> dict[int, Float64]:
-    """T_0_b (4, 4) by robot b, of those that can be brought into the first one's frame.
+    """T_0_b (4, 4) by robot b, for the robots that can be brought into the first one's frame.
 
-    Links that more guesses agree on are taken first.
+    Links that more hypotheses agree on are used first.
     """
     placed = {0: np.eye(4)}
     while True:
@@ -263,12 +263,12 @@ def place_robots(count: int, merges: dict[tuple[int, int], PairMerge]) -> dict[i
 def judge_team(
     team: Team, merges: dict[tuple[int, int], PairMerge], spec: MultiRobotSpec
 ) -> dict[str, Any]:
-    """Figures of a team, of the robots that were merged with the first and of each alone.
+    """Measures of the robots merged with the first, and of each robot alone.
 
-    Keys as in the registry of metrics: what came of each pair, and ``by_source`` from the guesses
-    of one source; the trajectories (one SE(3) alignment for all, and the first robot's start as the
-    only tie); the merged map against all that the robots saw; ``alone``: each robot without the
-    others, its map tied by its own true start.
+    Keys are those of the metric registry: the result of each pair, and ``by_source`` with the
+    hypotheses of one source; errors of the trajectories (with one SE(3) alignment for all, and
+    with only the first robot's start aligned); the merged map compared with everything the robots
+    saw; ``alone``: each robot on its own, with its map placed by its true start.
     """
     foreign = len(team.robots) - 1 if spec.setting == FOREIGN else None
     pairs = []
@@ -304,7 +304,7 @@ def judge_team(
 def team_errors(
     estimates: list[Float64], truths: list[Float64], tracked: list[NDArray[np.bool_]]
 ) -> dict[str, Any]:
-    """Errors of the trajectories (N, 4, 4) of a team in one world, by keys of the registry."""
+    """Errors of the trajectories (N, 4, 4) of a team in one world frame, by registry key."""
     ate = metrics.team_ate(estimates, truths)
     joined = np.concatenate(estimates), np.concatenate(truths), np.concatenate(tracked)
     own = metrics.tracked_errors(*joined)
@@ -319,10 +319,10 @@ def team_errors(
 
 
 def serve(team: Team, T_world_map: dict[int, Float64], spec: MultiRobotSpec) -> dict[str, Any]:
-    """The same figures after the server has optimised the trajectories and fused the map anew.
+    """The team's measures after the server has optimised the trajectories and fused the map again.
 
-    ``server_cpu_s`` is the processor time of the pose graph, without that of the fusion;
-    ``noise_ratio`` is that of the fused map, ``merged_noise_ratio`` of the maps laid together.
+    ``server_cpu_s`` is the processor time of the pose graph, without the fusion; ``noise_ratio`` is
+    that of the fused map, ``merged_noise_ratio`` that of the merged maps before fusion.
     """
     began = time.process_time()
     made = optimise_team(team.robots, T_world_map)
@@ -352,7 +352,7 @@ def serve(team: Team, T_world_map: dict[int, Float64], spec: MultiRobotSpec) -> 
 
 
 def _judge_merge(team: Team, a: int, b: int, merge: Merge, same_scene: bool) -> dict[str, Any]:
-    """Figures of one attempt to merge robot b's map into robot a's."""
+    """Measures of one attempt to merge robot b's map into robot a's."""
     fit = merge.fit
     entry: dict[str, Any] = {
         "merged": merge.T_a_b is not None,
@@ -386,7 +386,7 @@ def pair_error(team: Team, a: int, b: int, T_a_b: Float64) -> dict[str, float]:
 
 
 def _alone(team: Team, k: int) -> dict[str, Any]:
-    """A robot without the others."""
+    """Measures of a robot without the others."""
     robot, truth = team.robots[k], team.truths[k]
     points = transform_points(truth[0], robot.backend.surface_points())
     return {
@@ -406,7 +406,7 @@ _BESIDE = {
     "team_rpe_m": "rpe_m",
     **{f"f_score_{n}cm": "" for n in (2, 5)},
 }
-"""Measures of a team and, where of another name, of a robot alone."""
+"""Measure of a team to that of a robot alone; empty if they have the same name."""
 _PAIR = (
     *("scene", "seed", "setting", "pair", *_MERGED, "merge_refusal", "hypotheses"),
     *("agreeing_hypotheses", "consistent_share", "photometric_correlation"),
@@ -418,18 +418,18 @@ _PAIR = (
 class MultiRobot(Experiment, Checked):
     """Several robots, each with a SLAM of its own, their maps merged
 
-    Every robot is carried along its own hand-held path and maps in the frame of its first camera;
-    where the robots started is not told. Maps are merged where frames of one robot are found in the
-    map of another. In the setting foreign the last robot is in another scene of the same kind: its
-    map must not be merged. The team is judged by the measures of USME (equations 14 to 20).
+    Every robot follows its own hand-held path and maps in the frame of its first camera; the start
+    poses of the others are unknown. Maps are merged where frames of one robot are recognised in the
+    map of another. In the setting foreign, the last robot is in another scene of the same kind, and
+    its map must not be merged. The team is evaluated by USME's measures (equations 14 to 20).
     """
 
     robots: int = bounded(2, 2, 3)
-    """Robots in a team, 2 or 3."""
+    """Number of robots in a team, 2 or 3."""
     scenes: tuple[str, ...] = ("living_room", "table", "corridor", "window")
     """Names of scenes, or mesh files."""
     settings: tuple[str, ...] = (SHARED,)
-    """shared: all robots in one scene; foreign: the last one in another of the same kind."""
+    """shared: all robots in one scene; foreign: the last one in another scene of the same kind."""
     seeds: str = "validation"
     """Split that the seeds come from: train, validation or test; or your own, as 7000-7003."""
     teams: int = 1
@@ -441,9 +441,9 @@ class MultiRobot(Experiment, Checked):
     noise: str = "kinect"
     """Noise of the sensors: kinect or none."""
     least_overlap: float = bounded(0.3, 0.0, 1.0)
-    """Share of the surface a robot sees that one before it must see too."""
+    """Least share of the surface seen by a robot that an earlier robot must see, too."""
     merge: MergeConfig = field(default_factory=MergeConfig)
-    """How maps are merged."""
+    """How to merge maps."""
     server: bool = False
     """Optimise trajectories and map jointly after merging, and compare."""
 
@@ -457,7 +457,7 @@ class MultiRobot(Experiment, Checked):
 
     @staticmethod
     def run(spec: MultiRobotSpec) -> dict[str, Any]:
-        """Map, merge and judge."""
+        """Map, merge and evaluate."""
         team = make_team(spec)
         begin = time.process_time()
         merges = merge_pairs(team.robots, spec.merge)
@@ -465,7 +465,7 @@ class MultiRobot(Experiment, Checked):
         return {**judge_team(team, merges, spec), "merge_cpu_s": merge_s}
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """Merges by setting and by source of the guesses, the teams, their pairs."""
+        """Merges by setting and by source of hypotheses, the teams, and their pairs."""
         pairs = flattened(rows, "pairs")
         errors = ("merge_error_m", "merge_error_deg")
         settings = Grouping(("setting", "robots", "same_scene"), (*_MERGED, *errors), count="pairs")
@@ -481,7 +481,7 @@ class MultiRobot(Experiment, Checked):
 
 
 def _teams(rows: Sequence[Row]) -> Table:
-    """Every team, and beside each measure the mean of its robots alone."""
+    """Every team, with the mean of its robots alone beside each measure."""
     columns: list[Column | str] = ["scene", "seed", "setting", "robots", "merged_robots"]
     beside = {key: _BESIDE[key] or key for key in measured(tuple(_BESIDE), rows)}
     for key, own in beside.items():

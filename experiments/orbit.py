@@ -1,4 +1,4 @@
-"""USME's test of relocalisation: an orbit around an object, black frames after its first lap."""
+"""USME's relocalisation test: an orbit around an object, with black frames after the first lap."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class OrbitSpec:
 class Orbit(Experiment, Checked):
     """Relocalisation time on an orbit around an object
 
-    As USME describes it: the camera goes around a textured object a few times; after the first lap
-    stretches of frames are black. Time from the end of a stretch to the next pose (equation 11),
-    and apart from it after how many there was none before the next.
+    As USME describes it, the camera orbits a textured object a few times, and stretches of frames
+    after the first lap are black. Measures the time from the end of a stretch to the next pose
+    (equation 11) and, separately, the number of stretches after which no pose came before the next.
     """
 
     scenes: tuple[str, ...] = ("table", "living_room")
@@ -56,9 +56,9 @@ class Orbit(Experiment, Checked):
     stretches: int = bounded(2, 1, 100)
     """Black stretches in each lap after the first."""
     laps: int = bounded(3, 2, 100)
-    """Times around the object."""
+    """Number of laps around the object."""
     image_size: str = "160x120"
-    """Of the camera."""
+    """Image size of the camera."""
     seeds: str = "validation"
     """Split that the seeds come from: train, validation or test; or your own, as 7000-7003."""
     recordings: int = bounded(2, 1, 1000)
@@ -68,7 +68,7 @@ class Orbit(Experiment, Checked):
         """Every run.
 
         Raises:
-            InputError: a name that stands for nothing, or no length.
+            InputError: an unknown name, or no length.
         """
         if not self.black_frames or min(self.black_frames) < 1:
             raise InputError(f"black_frames {self.black_frames} must be numbers of frames, >= 1")
@@ -82,7 +82,7 @@ class Orbit(Experiment, Checked):
 
     @staticmethod
     def run(spec: OrbitSpec) -> dict[str, Any]:
-        """Track the orbit, in the dark too, and measure."""
+        """Track the orbit, including black frames, and measure."""
         from ms_slam_experiments.shared.loop_paths import around_object
 
         limit_threads(1)
@@ -118,7 +118,7 @@ class Orbit(Experiment, Checked):
         }
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """Medians by length of the dark and backend, then every run."""
+        """Medians by length of the black stretches and backend, then every run."""
         grouping = Grouping(("black_frames", "backend"), METRICS, count="recordings")
         lines = [{**row["spec"], **row["result"]} for row in finished(rows)]
         columns = ("scene", "seed", "black_frames", "backend", *METRICS, "black_tracked")

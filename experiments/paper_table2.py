@@ -16,7 +16,7 @@ MOTIONS = {
     "MSActiveSLAM-FreeCamera-v0": "free motion",
     "MSActiveSLAM-FixedTranslation-v0": "fixed translation",
 }
-"""The environments of the two experiments of the table, and what they are called there."""
+"""Environments of the table's two experiments to their names in the table."""
 PAPER_CUTS = {
     "MSActiveSLAM-FreeCamera-v0": {"ate_m": 1 - 0.1549 / 0.2343, "rer_m": 1 - 0.0518 / 0.0773},
     "MSActiveSLAM-FixedTranslation-v0": {
@@ -24,7 +24,7 @@ PAPER_CUTS = {
         "rer_m": 1 - 0.0726 / 0.0809,
     },
 }
-"""By how much active SLAM cuts the errors of random walk in the paper's table."""
+"""How much active SLAM cuts the errors of random walk in the paper's table, as shares."""
 METRICS = (
     *("ate_m", "ate_tracked_m", "tracked_share", "rer_m", "rcm", "path_length_m"),
     *("rcm_tracked", "lost"),
@@ -36,13 +36,13 @@ _CUTS = ("ate_cut", "ate_cut_paper", "rer_cut", "rer_cut_paper")
 class PaperTable2(SteppedExperiment):
     """Table II of the paper: an active planner against random walk
 
-    Errors of trajectory and map with free motion and with a fixed translation.
+    Compares errors of trajectory and map, with free motion and with a fixed translation.
     """
 
     active: str = "greedy"
     """The active planner, options appended as in greedy,rho_I=0.3."""
     baseline: str = "random"
-    """What it is compared with."""
+    """Planner to compare it with."""
     scenes: tuple[str, ...] = ("living_room",)
     """Names of scenes, or mesh files; the paper has one living room."""
     episodes: int = 20
@@ -51,15 +51,15 @@ class PaperTable2(SteppedExperiment):
 
     @property
     def planners(self) -> Sequence[str]:
-        """Both."""
+        """Both planners."""
         return self.baseline, self.active
 
     def compared(self) -> Sequence[Mapping[str, Any]]:
-        """Both planners with every motion."""
+        """Both planners with each kind of motion."""
         return [{"env_id": env_id, "planner": name} for env_id in MOTIONS for name in self.planners]
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """Medians by experiment and planner, and the cuts of the errors beside the paper's."""
+        """Medians by experiment and planner, and the cuts of the errors beside the paper's cuts."""
         order = list(MOTIONS)
         pairs = sorted(
             paired(rows),
@@ -118,7 +118,7 @@ def _paper_heading(name: str) -> str:
 def paired(rows: Sequence[Row]) -> list[Row]:
     """Rows of the episodes that both planners finished.
 
-    ``rcm_tracked`` is their completeness where tracking was never lost, else None.
+    ``rcm_tracked`` is the completeness if tracking was never lost, otherwise None.
     """
     pairs = complete_cases(rows, ("env_id", "scene", "seed"), "planner")
     return [

@@ -1,4 +1,4 @@
-"""Are the covariances of the surfel SLAM's poses right? Predicted against true errors.
+"""Are the covariances of the surfel SLAM's poses right? Compare predicted and true errors.
 
 If the covariance C of the twist xi (the error) is right, xi^T C^-1 xi follows the chi-squared
 distribution with six degrees of freedom.
@@ -50,23 +50,23 @@ class CovarianceSpec:
 class PoseCovariance(Experiment, Checked):
     """Are the covariances of the surfel SLAM's poses right?
 
-    Every frame of a rendered sequence is tracked against a map that was fused at the true poses, so
-    the error is that of one alignment and drift has no part in it; the state is then set back and
-    the frame fused at its true pose.
+    Every frame of a rendered sequence is tracked against a map fused at the true poses, so that the
+    error is that of one alignment, without drift. Then the state is reset, and the frame is fused
+    at its true pose.
     """
 
     scenes: tuple[str, ...] = ("living_room", "table", "window", "corridor", "wall", "carpet")
-    """Where the sequences are rendered."""
+    """Scenes in which to render the sequences."""
     validation_seeds: tuple[int, ...] = (1000, 1001)
-    """Of scenes and paths from which the scale of the covariance comes."""
+    """Seeds of scenes and paths for calibrating the scale of the covariance."""
     test_seeds: tuple[int, ...] = (2000, 2001)
-    """Of those on which it is judged."""
+    """Seeds of scenes and paths for testing it."""
     size: str = "160x120"
-    """Of the images."""
+    """Image size."""
     frames: int = bounded(60, WARM_UP + 2, 100_000)
     """Length of each sequence."""
     noise: str = "kinect"
-    """Of the sensor."""
+    """Noise of the sensor."""
     speed_m: float = 0.03
     """Largest translation from frame to frame."""
     rot_deg: float = 2.0
@@ -95,7 +95,7 @@ class PoseCovariance(Experiment, Checked):
         return measure(slam.make("surfel", intrinsics), frames, list(poses))
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """Shares within the bounds, of all scenes together and of each."""
+        """Shares of errors within the bounds, for all scenes together and for each."""
         results = _by_split(rows)
         groups = {f"{seeds}, all scenes": found for seeds, found in results.items()}
         groups |= {
@@ -111,7 +111,7 @@ class PoseCovariance(Experiment, Checked):
         return [make_table(("sequence", *COUNTS, *BOUNDS, *SIZES), lines, note=note)]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """The share of errors within an ellipsoid over the share that it promises."""
+        """Share of errors found in an ellipsoid over the share that it promises."""
         promised = np.linspace(0.01, 0.99, 99)
         limits = chi2_limits(promised)
         series = [Series("right", [0.0, 1.0], [0.0, 1.0], mode="lines")]
@@ -124,7 +124,7 @@ class PoseCovariance(Experiment, Checked):
         return [Chart("pose_covariance", "Promised and found", caption, [panel])]
 
     def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        """The factor of the validation seeds, and what it makes of the test seeds."""
+        """The factor from the validation seeds, and the coverage on test seeds with it."""
         results = _by_split(rows)
         factor = scale(squared_errors(results[VALIDATION]))
         met = coverage(squared_errors(results[TEST]), factor)
@@ -134,7 +134,7 @@ class PoseCovariance(Experiment, Checked):
 def measure(
     backend: slam.SlamBackend, frames: Sequence[RGBDFrame], poses: Sequence[Float64]
 ) -> dict[str, Any]:
-    """Track every frame against the map of the true poses (4, 4) before it.
+    """Track every frame against the map of the frames before it at their true poses (4, 4).
 
     An error is the twist xi, metres and radians, for which T_estimate exp(xi) is the truth.
     """
@@ -174,27 +174,27 @@ def squared(twists: Float64, covariances: Float64) -> Float64:
 
 
 def chi2_limits(shares: ArrayLike) -> Float64:
-    """What so large a share of right squared errors is below."""
+    """Limits below which these shares of the squared errors lie if the covariances are right."""
     from scipy.stats import chi2
 
     return np.asarray(chi2.ppf(shares, DEGREES_OF_FREEDOM))
 
 
 def coverage(squared: Float64, factor: float = 1.0) -> list[float]:
-    """Share of errors within the ellipsoids of ``BOUNDS``, covariances times ``factor``."""
+    """Share of errors within the ellipsoids of ``BOUNDS``, with covariances times ``factor``."""
     limits = factor * chi2_limits(list(BOUNDS.values()))
     return [float((squared < limit).mean()) if len(squared) else np.nan for limit in limits]
 
 
 def scale(squared: Float64) -> float:
-    """Factor of the covariances with which nine tenths of the errors are within that bound."""
+    """Factor of the covariances for which 90 % of the errors lie within the 90 % bound."""
     if not len(squared):
         return float("nan")
     return float(np.quantile(squared, 0.9) / chi2_limits(0.9))
 
 
 def squared_errors(results: Iterable[Mapping[str, Any]]) -> Float64:
-    """Those of all sequences (N,)."""
+    """Squared errors (N,) of all sequences."""
     return np.array([value for result in results for value in result["squared_errors"]])
 
 
@@ -211,7 +211,7 @@ def pooled(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _rms(squares: ArrayLike) -> float:
-    """Root of the mean over frames of the sum over axes."""
+    """Root of the mean over frames of the sum over axes of ``squares``."""
     array = np.asarray(squares)
     return float(np.sqrt(array.sum(axis=1).mean())) if len(array) else float("nan")
 

@@ -1,4 +1,4 @@
-"""What SLAM's pose costs against the arm's kinematics and against the truth."""
+"""Compare episodes that use the pose from SLAM, from the arm's kinematics, and the truth."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from ms_slam_env.report.statistics import Interval, relative_cut
 from ms_slam_env.report.tables import Grouping, Table, complete_cases, grouped, make_table, measured
 
 REFERENCE = "slam"
-"""The source that the others are compared with, episode by episode."""
+"""Reference source, with which the others are compared episode by episode."""
 METRICS = (
     *("ate_m", "ate_tracked_m", "tracked_share", "ate_unaligned_m", "rpe_m"),
     *("f_score_2cm", "f_score_5cm", "rcm", "lost"),
 )
 EVERYWHERE = "all"
-_DIGITS = 9  # nanometres: what is left of zero after an alignment
+_DIGITS = 9  # nanometres, the rounding error of zero after an alignment
 
 
 @dataclass(frozen=True)
 class PoseSourceExperiment(SteppedExperiment):
     """The same episodes with the pose from SLAM, kinematics, both, and the truth
 
-    What the estimate of the pose costs the map, and the planner that looks at it.
+    Measures how much the estimated pose costs the map, and the planner that uses the map.
     """
 
     sources: tuple[str, ...] = tuple(POSE_SOURCES)
@@ -59,7 +59,7 @@ class PoseSourceExperiment(SteppedExperiment):
         ]
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line a scene (last all together), planner and source."""
+        """One line per scene (all together last), planner and source."""
         common = compared(rows)
         everywhere = [{**r, "spec": {**r["spec"], "scene": EVERYWHERE}} for r in common]
         by_scene = sorted(common, key=lambda row: self.scenes.index(row["spec"]["scene"]))
@@ -88,9 +88,9 @@ class PoseSourceExperiment(SteppedExperiment):
 
 
 def compared(rows: Sequence[Row]) -> list[Row]:
-    """Rows of the episodes that every source finished, the source as ``pose_source`` in the spec.
+    """Rows of the episodes that every source finished, with ``pose_source`` in the spec.
 
-    Numbers of single episodes are rounded to nanometres, so that none is a rounding error.
+    Values of single episodes are rounded to nanometres, to remove rounding errors.
     """
     named = [
         {**row, "spec": {**row["spec"], "pose_source": row["spec"]["options"]["pose"]}}
@@ -111,7 +111,7 @@ def _rounded(value: float | bool | None) -> float | bool | None:
 def _ratio(
     episodes: Sequence[Mapping[str, Any]], reference: Sequence[Mapping[str, Any]]
 ) -> Interval | None:
-    """Median ATE in units of the reference's, of the same episodes."""
+    """Median ATE divided by the reference's, over the same episodes."""
     if not reference:
         return None
     cut = relative_cut([e["ate_m"] for e in episodes], [e["ate_m"] for e in reference])

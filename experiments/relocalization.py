@@ -1,4 +1,4 @@
-"""Does the SLAM find its pose again after a kidnapping, and never a wrong one?"""
+"""Does SLAM find its pose again after a kidnapping, and never a wrong one?"""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from ms_slam_env.report.tables import Table, Value, finished, format_value, make
 from ms_slam_env.scenes import PUBLISHED_ROOMS, Scene
 from ms_slam_env.slam import SlamBackend
 
-DEPTH_LIMIT_M = 3.0  # readings beyond count neither as mapped nor as not
+DEPTH_LIMIT_M = 3.0  # readings beyond this are ignored
 FOUND_M, FOUND_DEG = 0.05, 5.0
 WRONG_M, WRONG_DEG = 0.10, 10.0
 _CLEARANCE_M = 0.1
-_AWAY_M, _AWAY_DEG = 0.3, 30.0  # a kidnapping ends at least so far from where it began
+_AWAY_M, _AWAY_DEG = 0.3, 30.0  # a kidnapping ends at least this far from its start
 _DRAWS = 300
-_VIEW = xtion("80x60").scaled(0.5)  # of the images by which mapped space is known
-_EVERY = 4  # mapped frames that are looked at
-_SAME_M = 0.05  # a point this close to the surface that a mapped frame saw was seen
+_VIEW = xtion("80x60").scaled(0.5)  # camera of the images that define mapped space
+_EVERY = 4  # stride in the mapped frames used for that
+_SAME_M = 0.05  # a point this close to the surface in a mapped frame counts as seen
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Setting:
     """A kind of interruption.
 
     Attributes:
-        offset_m: the camera reappears up to so far from a random earlier pose
-        offset_deg: and turned by up to so much.
-        mapped: least share of the view's readings there that the map holds.
-        black: fewest and most black frames in between; while they last the camera goes back along
-            its path, else it jumps to anywhere on it.
+        offset_m: largest distance of the new pose from a random earlier pose.
+        offset_deg: largest rotation from it.
+        mapped: least share of the new view's readings that the map holds.
+        black: smallest and largest number of black frames in between, during which the camera goes
+            back along its path; without black frames it jumps to any place on the path.
     """
 
     offset_m: float
@@ -62,7 +62,7 @@ SETTINGS: dict[str, Setting] = {
     "black": Setting(0.05, 4.0, 0.6, (5, 20)),
 }
 FOREIGN = "foreign"
-"""One more kind: the camera reappears in another scene, and nothing there may be recognised."""
+"""Further kind: the camera reappears in another scene, where nothing may be recognised."""
 ALL_SETTINGS = (*SETTINGS, FOREIGN)
 
 
@@ -73,7 +73,7 @@ class Interruption:
     Attributes:
         black: number of black frames before the camera sees again.
         poses: (N, 4, 4) true poses from then on.
-        source: index of the mapped pose that the first of them is near; -1 for none.
+        source: index of the mapped pose close to the first of them; -1 if there is none.
         mapped: share of the first view's readings that lie in mapped space.
     """
 
@@ -84,15 +84,15 @@ class Interruption:
 
 
 def map_path(scene: Scene, frames: int, seed: int) -> Float64:
-    """Poses (frames, 4, 4) of the stretch that is mapped."""
+    """Poses (frames, 4, 4) of the mapped stretch."""
     return sequences.handheld_trajectory(scene, frames, seed)
 
 
 class MappedSpace:
-    """What a camera has seen from the poses of a path."""
+    """Space that a camera has seen from the poses of a path."""
 
     def __init__(self, scene: Scene, path: Float64, intrinsics: Intrinsics = _VIEW) -> None:
-        """Look from every few poses of ``path`` (N, 4, 4)."""
+        """Render views from every ``_EVERY``-th pose of ``path`` (N, 4, 4)."""
         self._sensor = sensor.RGBDSensor(scene, intrinsics, noise="none")
         self._intrinsics = intrinsics
         some = path[::_EVERY]
@@ -100,9 +100,9 @@ class MappedSpace:
         self._depths = [self._sensor.ground_truth(pose).depth for pose in some]
 
     def share(self, T_world_camera: Float64) -> float:
-        """Share of the readings from a pose (4, 4) that the path has seen.
+        """Share of the readings at a pose (4, 4) that were seen from the path.
 
-        0 where less than half of the pixels have a reading in the range of the map.
+        0 if less than half of the pixels have a reading within the map's range.
         """
         view = self._sensor.ground_truth(T_world_camera)
         reading = (view.depth > 0) & (view.depth <= DEPTH_LIMIT_M)
@@ -118,7 +118,7 @@ class MappedSpace:
             inside = (local[:, 2] > 0.05) & (local[:, 2] <= DEPTH_LIMIT_M)
             inside &= (u >= 0) & (u < width) & (v >= 0) & (v < height)
             at = depth[v[inside].astype(int), u[inside].astype(int)]
-            # One pixel is centimetres of a slanted surface.
+            # A pixel covers centimetres on a slanted surface.
             near = np.abs(at - z[inside]) < _SAME_M * np.maximum(1.0, z[inside])
             seen[np.flatnonzero(inside)[near]] = True
         return float(seen.mean())
@@ -132,9 +132,9 @@ def draw_interruption(
     after: int,
     rng: np.random.Generator,
 ) -> Interruption | None:
-    """Draw one interruption at the end of ``path`` (M, 4, 4) with ``after`` frames behind it.
+    """Draw an interruption at the end of ``path`` (M, 4, 4), followed by ``after`` frames.
 
-    None if no pose was found that satisfies the setting.
+    None if no pose satisfies the setting.
     """
     for _ in range(_DRAWS):
         offset = _random_motion(setting, rng)
@@ -159,12 +159,12 @@ def draw_interruption(
 
 
 def foreign_interruption(other: Scene, after: int, seed: int) -> Interruption:
-    """The camera reappears on a path of its own in scene ``other``."""
+    """An interruption after which the camera is on a new path in scene ``other``."""
     return Interruption(0, sequences.handheld_trajectory(other, after, seed), -1, 0.0)
 
 
 def _random_motion(setting: Setting, rng: np.random.Generator) -> Float64:
-    """A motion (4, 4) of uniform size up to the setting's in a uniform direction."""
+    """A motion (4, 4) of uniformly drawn size, up to the setting's, in a random direction."""
     turn, step = rng.normal(size=3), rng.normal(size=3)
     turn *= np.radians(setting.offset_deg) * rng.random() / np.linalg.norm(turn)
     step *= setting.offset_m * rng.random() / np.linalg.norm(step)
@@ -179,18 +179,18 @@ def _is_away(a: Float64, b: Float64) -> bool:
 def interrupt(
     backend: SlamBackend, one: Interruption, frames: list[RGBDFrame], expected: Float64 | None
 ) -> dict[str, Any]:
-    """Put a SLAM that has mapped a path through an interruption.
+    """Run a backend that has mapped a path through an interruption.
 
     Args:
-        backend: the SLAM.
+        backend: the SLAM backend.
         one: the interruption.
-        frames: N, taken after it.
-        expected: (N, 4, 4) their poses in the map; None if they show nothing that it holds.
+        frames: N frames taken after it.
+        expected: (N, 4, 4) their poses in the map; None if the map holds nothing they show.
 
     Returns:
-        ``found``: a pose within 5 cm and 5 degrees of the expected one was given; ``wrong``: one
-        farther than 10 cm or 10 degrees off was, or any where none is expected; the others as the
-        registry defines them.
+        ``found``: a pose within 5 cm and 5 degrees of the expected one was given; ``wrong``: a pose
+        more than 10 cm or 10 degrees off was given, or any pose if none is expected; the others
+        as defined in the registry.
     """
     height, width = frames[0].depth.shape
     nothing = RGBDFrame(
@@ -198,7 +198,7 @@ def interrupt(
     )
     dark = run_sequence(backend, [nothing] * one.black, reset=False)
     run = run_sequence(backend, frames, reset=False)
-    tracked = run.anchored  # in a submap of its own the camera is not found yet
+    tracked = run.anchored  # in an unjoined submap, the camera does not count as found
     errors = []
     if expected is not None:
         errors = [pose_error(run.estimates[i], expected[i]) for i in np.flatnonzero(tracked)]
@@ -227,7 +227,7 @@ COLUMNS = (
     *("image_size", "setting", "variant", "attempts_count", "found", "wrong"),
     *("frames_to_pose", "relocalisation_s", "lost_frame_cpu_ms", "black_tracked"),
 )
-_OTHER_SEED = 500  # added to a scene's seed for the scene that nothing is known of
+_OTHER_SEED = 500  # added to a scene's seed for the unknown scene
 
 
 @dataclass(frozen=True)
@@ -248,13 +248,13 @@ class RelocalizationSpec:
 class Relocalization(Experiment, Checked):
     """Kidnapped cameras: how often, how soon and how truly SLAM finds its pose again
 
-    The camera maps a stretch of a path, then finds itself elsewhere, with or without black frames
-    in between, and moves on. Near, far and black lie in mapped space; foreign is another scene,
+    The camera maps a stretch of a path, is then moved elsewhere, with or without black frames in
+    between, and continues. Near, far and black end in mapped space; foreign ends in another scene,
     where any pose is wrong.
     """
 
     scenes: tuple[str, ...] = PUBLISHED_ROOMS
-    """Names of scenes; the maps take them in turns."""
+    """Names of scenes; successive maps alternate between them."""
     sizes: tuple[str, ...] = ("160x120", "320x240")
     """Image sizes."""
     settings: tuple[str, ...] = ALL_SETTINGS
@@ -262,15 +262,15 @@ class Relocalization(Experiment, Checked):
     variants: tuple[str, ...] = ("ferns", "local")
     """Variants of the relocalisation."""
     maps: int = bounded(25, 1, 100)
-    """Maps, each of its own seed."""
+    """Number of maps, each with its own seed."""
     jumps: int = bounded(4, 1, 1000)
     """Interruptions of each kind after each map."""
     map_frames: int = bounded(200, 50, 100_000)
-    """Length of the stretch that is mapped."""
+    """Length of the mapped stretch, in frames."""
     after: int = bounded(30, 2, 100_000)
-    """Frames after an interruption; in those the pose must be found."""
+    """Frames after an interruption, within which the pose must be found."""
     seeds: str = "validation"
-    """Split that the seeds come from; a default read from them may not use the test seeds."""
+    """Split that the seeds come from; do not derive defaults from test seeds."""
 
     unit = "maps"
 
@@ -293,7 +293,7 @@ class Relocalization(Experiment, Checked):
 
     @staticmethod
     def run(spec: RelocalizationSpec) -> dict[str, Any]:
-        """Map a path with every variant and interrupt it; the maps and all attempts."""
+        """Map a path with every variant and interrupt it; return the maps and all attempts."""
         scene = scenes.make(spec.scene, spec.seed)
         intrinsics = xtion(spec.size)
         path = map_path(scene, spec.map_frames, spec.seed)
@@ -314,13 +314,13 @@ class Relocalization(Experiment, Checked):
             mapping = run_sequence(backend, mapped, start=path[0])
             maps.append({"variant": variant, **_figures(mapping, path)})
             if mapping.lost_frames:
-                continue  # what its poses are worth is unknown
+                continue  # its poses cannot be judged
             state = backend.get_state()
             for (name, one), frames in zip(interruptions, recordings, strict=True):
                 backend.set_state(state)
                 expected = None
                 if name != FOREIGN:
-                    # Where the map has drifted, it is there that the camera must be found.
+                    # If the map has drifted, the camera must be found at the drifted pose.
                     drift = mapping.estimates[one.source] @ invert(path[one.source])
                     expected = drift @ one.poses
                 outcome = interrupt(backend, one, frames, expected)
@@ -374,7 +374,7 @@ def _line(key: tuple[str, str, str], attempts: list[Row]) -> dict[str, Value]:
 
 
 def about_the_maps(rows: Sequence[Row]) -> str:
-    """How good the maps were, and how many were not used because a frame of theirs was lost."""
+    """Quality of the maps, and number of maps not used because a frame was lost."""
     maps = [figures for row in finished(rows) for figures in row["result"]["maps"]]
     used = [figures for figures in maps if not figures["lost_frames"]]
     ate = median_interval([figures["ate_unaligned_m"] for figures in used])
@@ -385,7 +385,7 @@ def about_the_maps(rows: Sequence[Row]) -> str:
 
 
 class _Recorder:
-    """Takes frames in a scene, each with noise of its own."""
+    """Takes frames in a scene, each with independent noise."""
 
     def __init__(self, scene: Scene, intrinsics: Intrinsics, seed: int) -> None:
         self._sensor = sensor.RGBDSensor(scene, intrinsics, seed=seed)
@@ -398,7 +398,7 @@ class _Recorder:
 
 
 def _draw(spec: RelocalizationSpec, scene: Scene, path: Float64) -> list[tuple[str, Interruption]]:
-    """All interruptions within the scene; fewer where no pose there satisfies a setting."""
+    """All interruptions within the scene; fewer if no pose satisfies a setting."""
     names = [name for name in SETTINGS if name in spec.settings]
     drawn: list[tuple[str, Interruption]] = []
     if not names:

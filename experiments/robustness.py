@@ -27,13 +27,13 @@ from ms_slam_env.sequences.sequence import Sequence as Recording
 MOST_LOST = 0.05
 """Share of the frames that a successful run may lose."""
 WORSE = 2.0
-"""Times the best median error of the sequence that a successful run may have."""
-_SIGMAS = 3.0  # that an error may have before the covariance is taken to be wrong
+"""Largest error of a successful run, as a multiple of the sequence's best median error."""
+_SIGMAS = 3.0  # an error of more standard deviations contradicts the covariance
 _ONE_IN = 1_000_000  # pixels
-_UNIT_M = 0.001  # of depth, in the images of most recordings
-_LARGEST = "640x480"  # the native size of what is rendered
+_UNIT_M = 0.001  # unit of depth in the images of most recordings
+_LARGEST = "640x480"  # the native size of rendered sequences
 USME = "usme:"
-"""Before the name of one of the eight USME sequences and a seed, as in usme:city-traffic:2000."""
+"""Prefix of one of the eight USME sequences and a seed, as in usme:city-traffic:2000."""
 
 ROOMS = ("living_room", "corridor", "table", "window", "wall", "carpet")
 PERTURBED = (
@@ -46,7 +46,7 @@ PERTURBED = (
 
 
 def default_sequences(seed: int) -> tuple[str, ...]:
-    """Rooms, a room with each perturbation, and the USME sequences, of one seed."""
+    """Rooms, a room with each perturbation, and the USME sequences, for one seed."""
     from ms_slam_env.sequences.usme_suite import NAMES
 
     rooms = [f"{scene}:{seed}" for scene in ROOMS]
@@ -55,13 +55,13 @@ def default_sequences(seed: int) -> tuple[str, ...]:
 
 
 class ChangedFrames(Frames):
-    """Frames of another sequence, some of them and each changed.
+    """A selection of another sequence's frames, each changed.
 
     Args:
-        frames: to change.
-        indices: (M,) of those that are taken, in this order.
-        times: (M,) seconds.
-        change: of one frame, with its number among those taken.
+        frames: original frames.
+        indices: (M,) indices of the selected frames, in order.
+        times: (M,) their new times, seconds.
+        change: function of a frame and its number in the selection.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ def _one_column_less(frame: RGBDFrame, index: int) -> RGBDFrame:
 
 
 def _one_unit_of_depth(frame: RGBDFrame, index: int) -> RGBDFrame:
-    """One pixel of a million is a millimetre farther, and one of the second frame."""
+    """Add a millimetre to one pixel in a million, and to one pixel of the second frame."""
     is_moved = np.random.default_rng([index, 7]).random(frame.depth.shape) < 1.0 / _ONE_IN
     if index == 1:
         is_moved.flat[np.flatnonzero(frame.depth)[: 1 if frame.depth.any() else 0]] = True
@@ -136,7 +136,7 @@ VARIATIONS: dict[str, Callable[[Recording], Recording]] = {
     "brighter": lambda given: _changed(given, change=_brighter),
     "reversed": lambda given: _changed(given, range(len(given) - 1, -1, -1), mirrored=True),
 }
-"""Name to change: none of them makes a sequence harder."""
+"""Name to change of a sequence that makes it no harder."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class RobustnessSpec:
     frames: int
 
     def opened(self) -> Recording:
-        """The sequence, changed."""
+        """The changed sequence."""
         from ms_slam_env import scenes
         from ms_slam_env.sequences import HandheldPath, open_sequence, usme_suite
 
@@ -164,7 +164,7 @@ class RobustnessSpec:
         else:
             path = HandheldPath(self.frames)
             size = self.image_size
-            if self.layout:  # a recording may have another aspect
+            if self.layout:  # a recording may have another aspect ratio
                 size = size if size == NATIVE else f"{size}+crop"
             elif size == NATIVE:
                 size = _LARGEST
@@ -178,38 +178,38 @@ class RobustnessSpec:
 class Robustness(Experiment, Checked):
     """How often SLAM succeeds when nothing that matters changes
 
-    Every backend runs over every sequence at every image size, as it is and with small changes that
-    make it no harder: one pixel of depth in a million a millimetre farther, the first frame or five
-    of them left out, a column cropped, one grey value brighter, mirrored in time. A run succeeds
-    that loses at most 5 % of the frames and has at most twice the best median error of its
-    sequence, over sizes and backends. A failed run is told where it lost frames, or its covariance
-    explains the error.
+    Every backend runs over every sequence at every image size, unchanged and with small changes
+    that make it no harder: one depth pixel in a million 1 mm farther, the first frame or the first
+    five left out, a column cropped, one grey level brighter, reversed in time. A run succeeds if it
+    loses at most 5 % of the frames and its error is at most twice the best median error of the
+    sequence over sizes and backends. SLAM reveals a failed run if it lost more frames, or if its
+    covariance explains the error.
     """
 
     sequences: tuple[str, ...] = ()
     """scene:seed[:word[+word ...]] or usme:NAME:seed; by default rooms, a room with each
     perturbation, and the USME sequences, of ``seeds``."""
     seeds: tuple[int, ...] = (1000, 2000)
-    """Of the default sequences: below 2000 options are tuned, from there on judged."""
+    """Seeds of the default sequences: those below 2000 are for tuning, others for judging."""
     recordings: tuple[str, ...] = ()
-    """NAME=FOLDER, NAME=LAYOUT:FOLDER where the layout must be said, as in
+    """NAME=FOLDER, or NAME=LAYOUT:FOLDER if the layout cannot be detected, as in
     hololens=folder:data/hololens."""
     image_sizes: tuple[str, ...] = (
         *("100x75", "128x96", "160x120", "213x160", "240x180", "320x240"),
         NATIVE,
     )
-    """Such as 160x120; of recordings with another aspect the central part."""
+    """Image sizes such as 160x120; recordings with another aspect ratio are cropped."""
     variations: tuple[str, ...] = tuple(VARIATIONS)
     """Changes of a sequence that make it no harder."""
     backends: tuple[str, ...] = ("surfel",)
     """NAME, parameters appended as in surfel,check_slips=true."""
     frames: int = bounded(150, 10, 100_000)
-    """Of a rendered sequence but for those of USME."""
+    """Number of frames of a rendered sequence, except USME's."""
 
     tracks = True
 
     def __post_init__(self) -> None:
-        """Refuse what no run could use."""
+        """Refuse settings that no run could use."""
         super().__post_init__()
         check_each("variation", self.variations, VARIATIONS)
         for size in self.image_sizes:
@@ -272,7 +272,7 @@ class Robustness(Experiment, Checked):
         return [*tables, make_table(shown, failed, "Runs that failed")]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
-        """Share of runs that succeed at each image size, a line a backend."""
+        """Share of runs that succeed at each image size, a line per backend."""
         lines = judged(rows)
         series = []
         for backend in dict.fromkeys(line["backend"] for line in lines):
@@ -301,7 +301,7 @@ def _usme(text: str) -> tuple[str, int]:
     """Name and seed of usme:NAME:SEED.
 
     Raises:
-        InputError: another form, or no such sequence; lists the valid choices.
+        InputError: malformed text, or unknown sequence; the message lists the valid choices.
     """
     from ms_slam_env.sequences.usme_suite import find
 
@@ -312,13 +312,13 @@ def _usme(text: str) -> tuple[str, int]:
 
 
 def position_sigma(covariances: Iterable[Float64 | None]) -> float | None:
-    """RMS over frames of the predicted standard deviation of the position, m; None: never said."""
+    """RMS over frames of the predicted standard deviation of the position, m; None if unknown."""
     said = [np.trace(one[:3, :3]) for one in covariances if one is not None]
     return float(np.sqrt(np.mean(said))) if said else None
 
 
 def judged(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Every finished run with whether it succeeded, and whether a failure was told."""
+    """Every finished run with whether it succeeded, and whether SLAM revealed a failure."""
     lines = [{**row["spec"], **row["result"]} for row in finished(rows)]
     cells: dict[tuple[str, ...], list[float]] = {}
     for line in lines:
@@ -338,13 +338,13 @@ def judged(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def part_of(source: str) -> str:
-    """Which part a sequence belongs to: on ``tuning`` ones options are chosen, never on others."""
+    """Part that a sequence belongs to: options are chosen only on ``tuning`` sequences."""
     seeds = [word for word in source.split(":")[1:] if word.isdecimal()]
     return "tuning" if seeds and int(seeds[0]) < 2000 else "judging"
 
 
 def _shares(lines: Sequence[Mapping[str, Any]], by: Sequence[str], title: str) -> Table:
-    """Shares of success, medians and the worst, of lines that have the same ``by``."""
+    """Shares of success, medians and the worst run, for lines with the same ``by``."""
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for line in lines:
         groups.setdefault(tuple(line[name] for name in by), []).append(line)

@@ -1,4 +1,4 @@
-"""Frames a second of many surfel SLAMs in one batch, on the CPU and on a GPU."""
+"""Measure the frames per second of many surfel SLAMs in one batch, on the CPU and on a GPU."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class BatchSpec:
 class SlamBatch(Experiment, Checked):
     """Frames a second of many surfel SLAMs in one batch
 
-    All are tracked in lockstep; frames come from the host, as from an environment.
+    All run in lockstep; frames come from host memory, as in an environment.
     """
 
     device: str = chosen("cpu", "cpu", "cuda")
@@ -61,19 +61,19 @@ class SlamBatch(Experiment, Checked):
     size: str = "160x120"
     """Image size."""
     scene: str = "living_room"
-    """Where the sequences are rendered."""
+    """Scene in which to render the sequences."""
     seed: int = 2000
-    """Of the scene; sequence k has trajectory and noise of ``seed + k``."""
+    """Seed of the scene; sequence k has trajectory and noise of ``seed + k``."""
     sequences: int = bounded(8, 1, 1000)
-    """Different sequences; larger batches repeat them."""
+    """Number of different sequences; larger batches repeat them."""
     frames: int = bounded(30, 2, 100_000)
-    """Length of a sequence."""
+    """Number of frames of a sequence."""
     warm_up: int = 10
     """Frames before the measurement."""
     max_surfels: int = bounded(60_000, 1000, 50_000_000)
-    """Capacity of a map: it determines the memory of an env."""
+    """Capacity of a map, which determines the memory per SLAM."""
     backend: tuple[str, ...] = ()
-    """Parameters of the SLAM that differ from the default, as in coverage_px=0.9."""
+    """Parameters of SLAM that differ from the default, as in coverage_px=0.9."""
 
     unit = "batches"
     workers = 1
@@ -92,18 +92,18 @@ class SlamBatch(Experiment, Checked):
         return [self.spec(BatchSpec, batch=batch) for batch in self.batch]
 
     def prepare(self) -> None:
-        """Refuse a GPU that is not there."""
+        """Refuse a GPU that does not exist."""
         if self.device == "cuda" and not wp.is_cuda_available():
             raise InputError("not measured on a GPU: this machine has no CUDA device")
 
     @staticmethod
     def run(spec: BatchSpec) -> dict[str, Any]:
-        """Track all envs in lockstep."""
+        """Run all SLAMs in lockstep."""
         images = render(spec.scene, spec.seed, spec.sequences, spec.frames, spec.size)
         return measure(spec, *images)
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line a batch."""
+        """One line per batch."""
         return [make_table(COLUMNS, [{**row["spec"], **row["result"]} for row in finished(rows)])]
 
 
@@ -126,7 +126,7 @@ def render(
 def measure(
     spec: BatchSpec, color: NDArray[np.uint8], depth: NDArray[np.float32], poses: Float64
 ) -> dict[str, Any]:
-    """Speed, memory and error of one batch; images and poses as `render` gives them."""
+    """Speed, memory and error of one batch; images and poses come from `render`."""
     batch, which = spec.batch, np.arange(spec.batch) % len(poses)
     config = SurfelConfig(**{"max_surfels": spec.max_surfels, **nested_options(spec.backend)})
     slam, size = device_bytes(
@@ -163,7 +163,7 @@ def measure(
 
 
 def device_bytes(make: Any) -> tuple[Any, int]:
-    """What ``make`` returns, and the bytes of the device arrays that it allocated."""
+    """Return value of ``make``, and the bytes of the device arrays that it allocated."""
     gc.collect()
     before = {id(thing) for thing in gc.get_objects() if isinstance(thing, wp.array)}
     made = make()

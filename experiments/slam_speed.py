@@ -1,4 +1,4 @@
-"""Processor time of a frame of the surfel SLAM, by stage, image size and stored surfels."""
+"""Measure the surfel SLAM's processor time per frame, by stage, image size and stored surfels."""
 
 from __future__ import annotations
 
@@ -52,29 +52,29 @@ class SpeedSpec:
 class SlamSpeed(Experiment, Checked):
     """Processor time of a frame of the surfel SLAM
 
-    By stage, image size and stored surfels; those beyond what the sequence makes lie in far places.
-    Every measurement is a process of its own on one core; rounds of all of them follow each other,
-    so that a busy machine disturbs all alike.
+    Measured by stage, image size and number of stored surfels; surfels beyond those of the sequence
+    lie in far places. Every measurement is a separate process on one core. All measurements repeat
+    in rounds, so that a busy machine affects them equally.
     """
 
     scene: str = "living_room"
-    """Where the sequence is rendered."""
+    """Scene in which to render the sequence."""
     seed: int = 2000
-    """Of scene, trajectory and noise."""
+    """Seed of scene, trajectory and noise."""
     sizes: tuple[str, ...] = ("160x120", "320x240")
     """Image sizes."""
     stored: tuple[int, ...] = (10_000, 100_000, 300_000, 1_000_000)
-    """Surfels in the map; those beyond what the sequence makes lie in far places."""
+    """Numbers of surfels in the map; those beyond the sequence's own lie in far places."""
     frames: int = bounded(80, 2, 100_000)
-    """Length of the sequence."""
+    """Number of frames of the sequence."""
     warm_up: int = 20
     """Frames before the measurement, which fill the map and load the kernels."""
     repeats: int = bounded(3, 1, 1000)
-    """Rounds; times are medians over them."""
+    """Number of rounds; times are medians over them."""
     against: Path | None = None
-    """Checkout with another version of the package, which runs in turns with this one."""
+    """Checkout with another version of the package, which runs alternately with this one."""
     backend: tuple[str, ...] = ()
-    """Parameters of the SLAM that differ from the default, ``name=value`` each (JSON values)."""
+    """Parameters of SLAM that differ from the default, ``name=value`` each (JSON values)."""
 
     unit = "measurements"
     workers = 1
@@ -89,7 +89,7 @@ class SlamSpeed(Experiment, Checked):
             raise InputError(f"{self.against} holds no package ms_slam_env")
 
     def specs(self) -> list[SpeedSpec]:
-        """Every round, size and version, in turns."""
+        """Every round, size and version, alternating."""
         backend_parameters(self.backend)
         checkouts = {THIS: ""}
         if self.against is not None:
@@ -147,7 +147,7 @@ class SlamSpeed(Experiment, Checked):
 
 
 def _figures(one: Mapping[str, Any]) -> dict[str, Any]:
-    """What is kept of a measurement of the child, whose frames are single."""
+    """Summary of a measurement by the child process, which returns single frames."""
     mean = float(np.mean(one["frame_ms"]))
     stages = {stage: float(np.mean(ms)) for stage, ms in one["stages_ms"].items()}
     stages[REST] = mean - sum(stages.values())
@@ -165,9 +165,9 @@ def _figures(one: Mapping[str, Any]) -> dict[str, Any]:
 def summarise(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """A line for each (size, stored surfels, version): medians over the rounds.
 
-    ``cpu_ratio`` is the mean frame of this version over that of the other, the median over the
-    rounds; ``same_poses`` says whether the two found bit for bit the same poses. Both None without
-    another version.
+    ``cpu_ratio`` is the mean time per frame of this version divided by the other's, median over
+    the rounds; ``same_poses`` says whether both found the same poses, bit for bit. Both are None
+    without another version.
     """
     groups: dict[tuple[str, int, str], list[dict[str, Any]]] = {}
     for row in finished(rows):
@@ -197,10 +197,10 @@ def _pixels(size: str) -> int:
 
 
 def backend_parameters(words: tuple[str, ...]) -> dict[str, Any]:
-    """Parameters of ``name=value`` words.
+    """Parameters from ``name=value`` words.
 
     Raises:
-        InputError: a word of another form, or a value that is no JSON.
+        InputError: a malformed word, or a value that is not JSON.
     """
     parameters = {}
     for word in words:
@@ -216,7 +216,7 @@ def backend_parameters(words: tuple[str, ...]) -> dict[str, Any]:
 
 @cache
 def stored_sequence(scene_name: str, seed: int, frames: int, size: str) -> tuple[Any, str]:
-    """A noisy sequence as a file, for as long as this process lives: its folder and its path."""
+    """Write a noisy sequence to a temporary file of this process; return its folder and path."""
     scene = scenes.make(scene_name, seed)
     poses = sequences.handheld_trajectory(scene, frames, seed, 0.015, 1.0)
     sequence = sequences.render_sequence(scene, poses, xtion(size), "kinect", seed)
@@ -236,8 +236,8 @@ def run_child(arguments: dict[str, Any], checkout: Path | None) -> list[dict[str
     """
     root = (checkout or Path(__file__).parents[1]).resolve()
     environment = os.environ | thread_environment(1) | {"PYTHONPATH": str(root)}
-    # Not as a script: its folder, first on the path, would hide modules of Python. In the checkout:
-    # the current folder comes before PYTHONPATH.
+    # Not run as a script, because its folder, first on the path, would hide Python modules. Run in
+    # the checkout, because the current folder comes before PYTHONPATH.
     words = [sys.executable, "-c", _START, str(slam_speed_child.__file__), json.dumps(arguments)]
     done = subprocess.run(words, env=environment, cwd=root, capture_output=True, text=True)
     if done.returncode != 0:

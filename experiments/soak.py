@@ -1,4 +1,4 @@
-"""A soak: many steps of every environment, in which nothing becomes NaN and no memory is lost."""
+"""Soak test: many steps of every environment, without NaN values and memory leaks."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from ms_slam_env.report.tables import Table, finished, make_table
 IDS = (*ENV_IDS, *TASK_IDS, *PERTURBED_ENV_IDS)
 
 PLAIN_IDS = ("MSActiveSLAM-FreeCamera-v0", "MSActiveSLAM-FixedTranslation-v0")
-"""The two whose steps are cheapest: nothing disturbs the camera, and a motion is a frame."""
+"""The two environments with the cheapest steps: no disturbances, and one frame per motion."""
 
 SHARE, ARM_SHARE = 10, 250
-"""Steps of a plain environment for one of another, and for one of the arm, which is ten frames and
-the physics of a motion."""
+"""Steps of a plain environment for each step of another one, and for each step of the arm, which
+takes ten frames and the physics of a motion."""
 
 
 @dataclass(frozen=True)
 class SoakSpec:
-    """One piece: so many steps of one environment, in a process of its own."""
+    """One piece: a number of steps of one environment, in a separate process."""
 
     env_id: str
     piece: int
@@ -40,23 +40,23 @@ class SoakSpec:
 class Soak(Experiment, Checked):
     """Steps of every environment with random permitted actions
 
-    Every number in observation, reward and info is looked at. Memory is that of the process after
-    each step: its peak in the second half of a piece over that in the first, which is the warm-up.
-    Pieces are finished one by one, and those that are there already are not run again. Most of the
-    steps are of the two environments whose steps cost least: of a million 272,000 of each, 27,200
-    of each other one without the arm, and 1,088 of each with it, in one piece: there a warm-up of
-    less would end before every scene was seen.
+    Checks every number in observation, reward and info. Growth of memory is the peak of the
+    process's memory in the second half of a piece over that in the first half, which is the
+    warm-up. Pieces finish one by one, and finished pieces are not run again. Most steps are of the
+    two environments with the cheapest steps: of a million steps, 272,000 of each of these, 27,200
+    of each other environment without the arm, and 1,088 of each with the arm. The latter are one
+    piece, since a shorter warm-up would end before every scene was seen.
     """
 
     env_ids: tuple[str, ...] = IDS
     """Environments."""
     steps: int = bounded(1_000_000, 1, 10**9)
-    """Of all environments together, rounded up to whole pieces of each."""
+    """Steps of all environments together, rounded up to whole pieces of each."""
     piece_steps: int = bounded(68_000, 2, 10**7)
-    """Of a piece of the free camera; a tenth if it is disturbed or has a task, a 250th for the arm
-    (whose pieces are one); at least 2."""
+    """Steps of a piece of the free camera; a tenth with disturbances or a task, 1/250 for the arm
+    (which has a single piece); at least 2."""
     image_sizes: tuple[str, ...] = ("80x60",)
-    """Of the camera, width x height: environments and their pieces take them in turn."""
+    """Image sizes, width x height, which environments and their pieces use in turn."""
 
     unit = "pieces"
     workers = 1
@@ -85,7 +85,7 @@ class Soak(Experiment, Checked):
 
     @staticmethod
     def run(spec: SoakSpec) -> dict[str, Any]:
-        """Take the steps of a piece, in a scene and with actions of its own."""
+        """Take the steps of a piece, with its own scene and actions."""
         env = gym.make(spec.env_id, scene_seed=spec.piece, image_size=spec.image_size)
         memory_mb: list[float] = []
         bad: list[str] = []
@@ -94,7 +94,7 @@ class Soak(Experiment, Checked):
             for info, is_first, *numbers in _steps(env, spec):
                 episodes += is_first
                 memory_mb.append(resident_mb() or np.nan)
-                covariance = info["pose_covariance"]  # infinite where SLAM gave none, never NaN
+                covariance = info["pose_covariance"]  # infinite if SLAM gave none, never NaN
                 known = {
                     **info,
                     "pose_covariance": np.where(np.isposinf(covariance), 0, covariance),
@@ -114,7 +114,7 @@ class Soak(Experiment, Checked):
         }
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line an environment."""
+        """One line per environment."""
         done = list(finished(rows))
         lines = []
         for env_id in dict.fromkeys(row["spec"]["env_id"] for row in done):
@@ -131,14 +131,14 @@ _SUMMED = ("measured_steps", "soak_episodes", "not_finite")
 
 
 def share(env_id: str) -> int:
-    """Steps of the free camera for one of this environment."""
+    """Number of steps of the free camera for each step of this environment."""
     if env_id in PLAIN_IDS:
         return 1
     return ARM_SHARE if gym.spec(env_id).kwargs["embodiment"] == "arm" else SHARE
 
 
 def _steps(env: gym.Env[Any, Any], spec: SoakSpec) -> Iterator[tuple[Any, ...]]:
-    """Info, whether an episode begins, observation and reward, of so many steps."""
+    """Info, whether an episode begins, observation and reward, for each step of the piece."""
     observation, info = env.reset(seed=spec.piece)
     env.action_space.seed(spec.piece)
     begins = True
@@ -152,7 +152,7 @@ def _steps(env: gym.Env[Any, Any], spec: SoakSpec) -> Iterator[tuple[Any, ...]]:
 
 
 def not_finite(value: Any, where: str = "") -> Iterator[str]:
-    """Places in nested mappings, sequences and arrays that hold NaN or infinity."""
+    """Names of entries in nested mappings, sequences and arrays that are NaN or infinite."""
     if isinstance(value, Mapping):
         for name, one in value.items():
             yield from not_finite(one, f"{where}.{name}" if where else str(name))

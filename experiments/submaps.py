@@ -1,4 +1,4 @@
-"""Does a lost camera go on in a submap, joined where it belongs and never elsewhere?"""
+"""Does a lost camera continue in a submap that is joined at the right place and nowhere else?"""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ COLUMNS = (
     *("final_ate_unaligned_m", "submap_ate_m", "cpu_ms_median"),
 )
 WRONG_M, WRONG_DEG = 0.05, 5.0
-TURN_DEG, STEP_DEG = 150.0, 3.0  # away from the end of the mapped stretch, and a frame's share
-DARK_DEG = 60.0  # of which are not seen
-_OTHER_SEED = 500  # added to a scene's seed for the scene that looks alike and is another
+TURN_DEG, STEP_DEG = 150.0, 3.0  # turn away from the end of the mapped stretch; per frame
+DARK_DEG = 60.0  # part of the turn during which frames are black
+_OTHER_SEED = 500  # added to a scene's seed for another scene that looks alike
 
 
 @dataclass(frozen=True)
@@ -59,29 +59,29 @@ class SubmapsSpec:
 class SubmapsExperiment(Experiment, Checked):
     """Lost cameras that go on: submaps, where they are joined, and what that is worth
 
-    The camera maps a stretch of a path. Return: suddenly it looks the other way, 150 degrees from
-    there, turns back and goes back over half of the stretch. Dark: it turns there and back, and
-    sees nothing for the first 60 degrees. Foreign: it goes on in another scene of the same kind,
-    and anything joined is wrong.
+    The camera maps a stretch of a path. Return: it suddenly looks in another direction, 150 degrees
+    away, turns back and goes back over half of the stretch. Dark: it turns there and back, and sees
+    nothing for the first 60 degrees. Foreign: it continues in another scene of the same kind, where
+    any joined submap is wrong.
     """
 
     scenes: tuple[str, ...] = ("living_room", "corridor")
-    """Names of scenes; the maps take them in turns. Corridors repeat themselves."""
+    """Names of scenes; successive maps alternate between them. Corridors have repeated parts."""
     size: str = "160x120"
     settings: tuple[str, ...] = KINDS
     """Kinds of interruption."""
     variants: tuple[str, ...] = SUBMAPS
     """Variants of the submaps."""
     maps: int = bounded(10, 1, 100)
-    """Maps, each of its own seed."""
+    """Number of maps, each with its own seed."""
     jumps: int = bounded(10, 1, 1000)
-    """Foreign places after each map; of the other settings there is one a map."""
+    """Foreign places after each map; the other settings occur once per map."""
     map_frames: int = bounded(60, 20, 100_000)
-    """Length of the stretch that is mapped."""
+    """Length of the mapped stretch, in frames."""
     after: int = bounded(30, 10, 100_000)
     """Frames in a foreign place."""
     seeds: str = "validation"
-    """Split that the seeds come from; a default read from them may not use the test seeds."""
+    """Split that the seeds come from; do not derive defaults from test seeds."""
 
     unit = "maps"
 
@@ -110,7 +110,7 @@ class SubmapsExperiment(Experiment, Checked):
             backend = slam.make("surfel", intrinsics, submaps=variant)
             mapping = run_sequence(backend, frames, start=path[0])
             state = backend.get_state()
-            drift = mapping.estimates[-1] @ invert(path[-1])  # where the camera comes back to
+            drift = mapping.estimates[-1] @ invert(path[-1])  # where the camera returns
             for one in interruptions:
                 if variant == "off" and one.truth is None:
                     continue  # it joins nothing
@@ -144,18 +144,18 @@ class SubmapsExperiment(Experiment, Checked):
 
 @dataclass(frozen=True)
 class Interruption:
-    """What the camera sees after it was interrupted."""
+    """Frames that the camera sees after an interruption."""
 
     setting: str
-    frames: list[RGBDFrame]  # N, the first of them black
-    black: int  # number of those
+    frames: list[RGBDFrame]  # N, the first of which are black
+    black: int  # number of black frames
     truth: Float64 | None  # (N, 4, 4) true poses; None in a foreign place
 
 
 def _interruptions(
     spec: SubmapsSpec, scene: Scene, intrinsics: Intrinsics, path: Float64
 ) -> list[Interruption]:
-    """A camera that has come to the end of ``path`` (N, 4, 4) goes on otherwise."""
+    """Interruptions of a camera that has reached the end of ``path`` (N, 4, 4)."""
     away, hidden = np.arange(0, TURN_DEG, STEP_DEG), int(DARK_DEG / STEP_DEG)
     back = np.concatenate([_turned(path[-1], away[::-1]), path[: len(path) // 2 : -1]])
     paths = {RETURN: (back, 0), DARK: (np.concatenate([_turned(path[-1], away), back]), hidden)}
@@ -174,7 +174,7 @@ def _interruptions(
 
 
 def _turned(pose: Float64, degrees: Float64) -> Float64:
-    """Poses (N, 4, 4) of a camera that turns about the vertical, stepping aside a little."""
+    """Poses (N, 4, 4) of a camera that turns about the vertical and moves slightly aside."""
     turned = np.repeat(pose[None], len(degrees), axis=0)
     turned[:, :3, :3] = [so3_exp([0, 0, angle]) @ pose[:3, :3] for angle in np.radians(degrees)]
     turned[:, 2, 3] += 0.001 * degrees
@@ -193,7 +193,7 @@ def _record(
 
 
 def _measure(run: SequenceRun, one: Interruption, mapped: int, drift: Float64) -> dict[str, Any]:
-    """What came of an interruption after ``mapped`` frames, whose map has a ``drift`` (4, 4)."""
+    """Result of an interruption after ``mapped`` frames, whose map has a ``drift`` (4, 4)."""
     joints = [k for k, result in enumerate(run.results) if result.submaps_joined]
     figures = {
         **submap_measures(run),

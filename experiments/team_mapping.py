@@ -1,4 +1,4 @@
-"""One, two and three robots map a place until a share of it is covered: what does a team save?"""
+"""One, two and three robots map a place until a share is covered: how much does a team save?"""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ METRICS = (
     *("steps_to_goal", "task_time_s", "mean_path_m", "team_path_m", "covered_share"),
     *("team_ate_m", "between_robots_m", "robots_lost"),
 )
-_APART_M = 0.5  # between the places where the robots begin
-_STARTS = 200  # drawn, of which those nearest to the first are taken
+_APART_M = 0.5  # distance between the robots' starts
+_STARTS = 200  # candidate starts, of which the closest to the first are used
 
 
 @dataclass(frozen=True)
@@ -55,26 +55,26 @@ class TeamMappingSpec:
 class TeamMapping(Experiment, Checked):
     """Teams of robots map a place to a coverage goal
 
-    Robots begin beside each other, know where, share an occupancy map and divide its frontiers;
-    each has a SLAM of its own. The task ends when the team has mapped the goal's share of the
-    reachable surface in its true place (USME equations 18 to 20: its time and mean path). Robots
-    do not see or hinder each other, and one whose camera is lost for good stays where it is.
+    Robots start side by side at known poses, share an occupancy map and divide its frontiers; each
+    has its own SLAM. The task ends when the team has mapped the required share of the reachable
+    surface in its true place (time and mean path: USME equations 18 to 20). Robots do not see or
+    obstruct each other, and a robot that does not recover from a loss stays where it is.
     """
 
     scenes: tuple[str, ...] = ("corridor", "home")
     """Names of scenes."""
     goals: tuple[float, ...] = (0.8, 0.5)
-    """Share of the surface to be mapped, of each scene."""
+    """Share of the surface to map, one value per scene."""
     robots: tuple[int, ...] = (1, 2, 3)
-    """Sizes of the teams."""
+    """Team sizes."""
     seeds: str = "validation"
     """Split that the seeds come from: train, validation or test; or your own, as 7000-7003."""
     teams: int = bounded(2, 1, 1000)
     """Seeds for each scene."""
     steps: int = bounded(200, 1, 100_000)
-    """Most steps of a robot; a goal not reached by then is never reached."""
+    """Largest number of steps of a robot; a goal not reached by then counts as never reached."""
     planner: str = PLANNER
-    """Planner of each robot, with its options; spread_m=0 lets it not divide frontiers."""
+    """Planner of each robot, with its options; with spread_m=0 it does not divide frontiers."""
 
     unit = "teams"
 
@@ -82,8 +82,8 @@ class TeamMapping(Experiment, Checked):
         """Every team.
 
         Raises:
-            InputError: a scene, split or planner that does not exist, goals that are no shares or
-                not one a scene, a team without robots.
+            InputError: a scene, split or planner that does not exist, goals that are not shares or
+                not one per scene, a team without robots.
         """
         check_planner(self.planner)
         if len(self.goals) != len(self.scenes) or not all(0 < goal <= 1 for goal in self.goals):
@@ -132,7 +132,7 @@ class TeamMapping(Experiment, Checked):
 
 
 class Team:
-    """Robots in a place, each in an environment of its own, whose planners share their map."""
+    """Robots in one scene, each in its own environment, whose planners share their map."""
 
     def __init__(self, spec: TeamMappingSpec) -> None:
         self._spec = spec
@@ -161,12 +161,12 @@ class Team:
         return [cast(ActiveSlamEnv, env.unwrapped) for env in self._envs]
 
     def close(self) -> None:
-        """Free what the environments hold."""
+        """Close the environments."""
         for env in self._envs:
             env.close()
 
     def map(self) -> dict[str, Any]:
-        """Step all robots until the goal is reached, and judge them."""
+        """Step all robots until the goal is reached, and return the team's measures."""
         shares = [self._share()]
         while shares[-1] < self._spec.goal and len(shares) <= self._spec.steps:
             for k in np.flatnonzero(~np.array(self._stopped)):
@@ -205,10 +205,10 @@ class Team:
 
 
 def nearby_starts(scene: Scene, first: Float64, count: int, seed: int) -> list[Float64]:
-    """Poses (4, 4) of ``count`` robots, the first given, the others near it, apart from each other.
+    """Poses (4, 4) of ``count`` robots: the first given, the others close to it but separated.
 
     Raises:
-        InputError: there is no room for so many.
+        InputError: there is no room for this many.
     """
     rng = np.random.default_rng([seed, 7])
     drawn = [scene.sample_start(rng) for _ in range(_STARTS)] if count > 1 else []
@@ -224,7 +224,7 @@ def nearby_starts(scene: Scene, first: Float64, count: int, seed: int) -> list[F
 
 
 def _episode(spec: TeamMappingSpec) -> EpisodeSpec:
-    """What a robot is in; its steps are those of the task of such a scene."""
+    """Episode of a robot, with the step size of the task for this scene."""
     task = "home" if spec.scene in HOMES else "room"
     options = find_task(task).options
     return EpisodeSpec(

@@ -1,1 +1,1 @@
-"""Pictures that no chart can show: maps, scenes, the arm, an episode."""
+"""Pictures of maps, scenes, the arm and an episode."""

@@ -1,7 +1,7 @@
-"""``python -m ms_slam_experiments.pictures.film``: an episode of a planner as a moving picture.
+"""``python -m ms_slam_experiments.pictures.film``: show an episode of a planner as an animation.
 
-Without options, the picture on top of the README: a planner explores a home. ``--gallery``: the
-films of the gallery, an episode of each id.
+Without options, it makes the picture at the top of the README: a planner explores a home. With
+``--gallery``, it makes the films of the gallery, one episode of each id.
 """
 
 from __future__ import annotations
@@ -43,27 +43,27 @@ from ms_slam_env.scenes.scene import Scene, floor_height
 
 _SIZE = (560, 480)  # width and height of the map
 _MARGIN_M = 0.2
-_BETWEEN_M = (0.3, 1.8)  # above the floor: what stands there is drawn in the plan
+_BETWEEN_M = (0.3, 1.8)  # heights above the floor that are drawn in the plan
 _UNKNOWN, _FREE, _OCCUPIED = (216, 218, 222), (255, 255, 255), (60, 66, 82)
 _GOAL_COLOR = (40, 90, 220)
 
 
 class EpisodeView:
-    """Draws the moments of an episode, here as ``render()`` does.
+    """Draws the moments of an episode, in this class like ``render()``.
 
     Args:
         env: the unwrapped environment, after its reset.
-        planner: whose episode it is.
+        planner: planner that plays the episode.
     """
 
     def __init__(self, env: ActiveSlamEnv, planner: Planner) -> None:
         self.env, self.planner = env, planner
 
     def see(self) -> None:
-        """Take note of a step; once after each."""
+        """Update the view; call it once after each step."""
 
     def draw(self) -> Image:
-        """The present moment, (H, W, 3) RGB."""
+        """The current moment, (H, W, 3) RGB."""
         return np.asarray(self.env.render(), dtype=np.uint8)
 
 
@@ -77,10 +77,10 @@ class CameraView(EpisodeView):
 
 
 class ExplorationView(EpisodeView):
-    """What the camera sees, the space that is known, and the map growing, all from one place.
+    """The camera's view, the known space, and the growing map, seen from a fixed place.
 
     The longer side of the scene lies across the picture. The plan is carved from the depth images
-    where SLAM believes that they were taken, whatever the planner keeps itself.
+    at their estimated poses, independently of the planner's own map.
     """
 
     def __init__(self, env: ActiveSlamEnv, planner: Planner) -> None:
@@ -96,7 +96,7 @@ class ExplorationView(EpisodeView):
         self.see()
 
     def see(self) -> None:
-        """Add the newest frame to the space that is known."""
+        """Add the newest frame to the known space."""
         episode = self.env.episode
         if episode.tracking_ok:
             pose = episode.T_world_camera_estimate
@@ -124,7 +124,7 @@ class ExplorationView(EpisodeView):
         return np.hstack([left, caption(self._map(), text)])
 
     def _map(self) -> Image:
-        """The map without what is seen from behind, so that walls and ceilings hide no room."""
+        """The map without surfaces seen from behind, so that walls and ceilings hide no room."""
         slam, episode = self.env.slam, self.env.episode
         points = slam.surface_points()
         shown = is_low(points, episode)
@@ -137,11 +137,11 @@ class ExplorationView(EpisodeView):
 
 
 class Plan:
-    """The cells of a grid from above, in the picture of a box.
+    """Draws the cells of a grid within a box from above.
 
     Args:
-        box: (8, 3) its corners, metres.
-        ahead: (3,) level direction that is up in the picture.
+        box: (8, 3) corners of the box, metres.
+        ahead: (3,) horizontal direction that points up in the picture.
         floor_m: height of the floor.
     """
 
@@ -157,11 +157,11 @@ class Plan:
         self.low -= ([width, height + 20] * np.array(self.m_per_pixel) - extent) / 2
 
     def pixels(self, points: Float64) -> NDArray[np.int32]:
-        """Where points (N, 3) are in the picture, (N, 2)."""
+        """Pixels (N, 2) of points (N, 3)."""
         return np.rint((points @ self.axes.T - self.low) / self.m_per_pixel).astype(np.int32)
 
     def draw(self, grid: OccupancyGrid) -> Image:
-        """What is free, occupied and unknown, (240, 320, 3) RGB."""
+        """Picture of free, occupied and unknown space, (240, 320, 3) RGB."""
         height, width = PANEL
         down, across = np.mgrid[:height, :width]
         level = (np.stack([across, down], axis=-1) * self.m_per_pixel + self.low) @ self.axes
@@ -191,7 +191,7 @@ VIEWS = {"exploration": ExplorationView, "moment": EpisodeView, "camera": Camera
 
 _FORMATS = (".webp", ".gif")
 _QUALITIES = (80, 65, 50, 40, 30, 20)  # of WebP, tried until the file is small enough
-_LAST_MS = 2500  # how long the end is shown
+_LAST_MS = 2500  # how long the last picture is shown
 
 
 @dataclass(frozen=True)
@@ -205,26 +205,26 @@ class Options(Checked):
     env_id: str = "MSActiveSLAM-Home-v0"
     """Id of the environment or task."""
     view: str = chosen("exploration", *VIEWS)
-    """exploration: the map from one place, and the space known; moment: what render() draws;
+    """exploration: the map from a fixed place, and the known space; moment: what render() draws;
     camera: its colour and depth images."""
     scene: str | None = None
-    """By default the id's own."""
+    """Scene; by default the id's own."""
     scene_seed: int = bounded(2000, 0, 2**31)
-    """Of the scene."""
+    """Seed of the scene."""
     seed: int = bounded(2000, 0, 2**31)
-    """Of start pose, noise and planner."""
+    """Seed of start pose, noise and planner."""
     steps: int = bounded(300, 1, 100_000)
-    """Length of the episode; it may end before."""
+    """Largest number of steps of the episode."""
     every: int = bounded(5, 1, 1000)
-    """Steps from picture to picture."""
+    """Number of steps between pictures."""
     options: tuple[str, ...] = ()
     """Further options of the environment, as name=value."""
     width: int = bounded(800, 64, 4096)
-    """Of the picture, pixels."""
+    """Width of the picture in pixels."""
     picture_ms: int = bounded(150, 20, 10_000)
-    """How long each picture is shown."""
+    """Time in milliseconds that each picture is shown."""
     most_kb: int = bounded(600, 10, 100_000)
-    """Size that the file is kept below, by the quality of a WebP."""
+    """Largest file size in kB; the quality of a WebP is reduced to reach it."""
     gallery: bool = False
     """Film an episode of each id, into environments/ID.webp beside OUT."""
 
@@ -236,7 +236,7 @@ class Options(Checked):
 
 
 def save_film(options: Options) -> str:
-    """Play the episode and write the file; return what came of it."""
+    """Play the episode and write the file; return a line that describes it."""
     scene: dict[str, Any] = {} if options.scene is None else {"scene": options.scene}
     env = gymnasium.make(
         options.env_id,
@@ -258,7 +258,7 @@ def save_film(options: Options) -> str:
 
 
 def play(env: gymnasium.Env[Any, Any], options: Options) -> Iterator[Image]:
-    """Pictures of the start, of every so many steps and of the end."""
+    """Pictures of the start, of every ``options.every``-th step, and of the end."""
     world = cast(ActiveSlamEnv, env.unwrapped)
     observation, info = env.reset(seed=options.seed)
     planner = make_planner(options.planner, world, seed=options.seed)
@@ -277,13 +277,13 @@ def play(env: gymnasium.Env[Any, Any], options: Options) -> Iterator[Image]:
 
 
 def narrowed(picture: Image, width: int) -> Image:
-    """A picture (H, W, 3) at another width."""
+    """A picture (H, W, 3) scaled to another width."""
     height = round(picture.shape[0] * width / picture.shape[1])
     return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
 def encoded(pictures: Sequence[Image], options: Options) -> bytes:
-    """The film as the content of a file, as good as its size allows.
+    """The film as file content, at the best quality that the size limit allows.
 
     Raises:
         InputError: it is too large at every quality.
@@ -302,13 +302,13 @@ def encoded(pictures: Sequence[Image], options: Options) -> bytes:
 
 
 SHOWN_IDS = (*ENV_IDS, *(name for name in PERTURBED_ENV_IDS if "-FreeCamera-" in name))
-"""Of the gallery: an imperfect camera takes the same pictures whoever holds it."""
+"""Ids in the gallery; an imperfect camera takes the same pictures with every embodiment."""
 _PLANNERS = {"MSActiveSLAM-FixedTranslation-v0": "greedy", "MSActiveSLAM-Adaptive-v0": "random"}
 _SCENES = {"MSActiveSLAM-v0": "table"}
 
 
 def gallery_film(env_id: str, folder: Path) -> Options:
-    """How the episode of an id is filmed: as `render()` shows it, or what a bad camera takes."""
+    """Options to film an episode of an id: as in `render()`, or the images of a bad camera."""
     plain = Options(
         out=folder / f"{env_id}.webp",
         planner=_PLANNERS.get(env_id, "nbv"),
@@ -328,7 +328,7 @@ def gallery_film(env_id: str, folder: Path) -> Options:
 
 
 def draw(options: Options) -> str:
-    """Write the film, or those of the gallery; return what was done."""
+    """Write the film, or the films of the gallery; return a line that describes them."""
     if not options.gallery:
         return save_film(options)
     folder = options.out.parent / "environments"

@@ -1,9 +1,9 @@
-"""The pictures of the pages: `python -m ms_slam_experiments.pictures.stills scenes homes usme arm`.
+"""Pictures for the pages: `python -m ms_slam_experiments.pictures.stills scenes homes usme arm`.
 
-``scenes``: two seeds of each scene in colour, depth and normals, as an ideal sensor sees them from
-the scene's own start poses. ``homes``: a floor plan, seen from far above without the ceilings, and
-views. ``usme``: two frames of each of its sequences. ``arm``: where an episode put it, seen from
-outside by the project's own renderer, and what its camera sees. No OpenGL is needed.
+``scenes``: two seeds of each scene in colour, depth and normals, as seen by an ideal sensor from
+the scene's start poses. ``homes``: floor plans, seen from far above without the ceilings, and
+views. ``usme``: two frames of each of its sequences. ``arm``: the arm in an episode, seen from
+outside by the project's renderer, and its camera's view. No OpenGL is needed.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ def run_script(
     check_out: Callable[[Path], None] = check_out_file,
     arguments: Sequence[str] | None = None,
 ) -> int:
-    """Draw by the command line of dataclass ``options``; return the exit code.
+    """Draw with options from the command line, parsed as dataclass ``options``; return exit code.
 
-    ``draw`` writes ``out`` of the options and returns a line to print.
+    ``draw`` writes the options' ``out`` and returns a line to print.
     """
     name = f"python -m ms_slam_experiments.pictures.{Path(inspect.getfile(options)).stem}"
 
@@ -64,7 +64,7 @@ def run_script(
 
 
 def save_image(path: Path, image: Image) -> Path:
-    """Write an RGB image (H, W, 3) as WebP if the name says so, else PNG; whole or not at all."""
+    """Write an RGB image (H, W, 3) atomically, as WebP if the name says so, otherwise as PNG."""
     kind = ".webp" if path.suffix == ".webp" else ".png"
     how = {".webp": [cv2.IMWRITE_WEBP_QUALITY, 85], ".png": [cv2.IMWRITE_PNG_COMPRESSION, 9]}
     _, data = cv2.imencode(kind, image[..., ::-1], how[kind])
@@ -73,7 +73,7 @@ def save_image(path: Path, image: Image) -> Path:
 
 
 def titled_row(images: Iterable[Image], title: str) -> Image:
-    """RGB images of one height side by side, framed in white, below a title."""
+    """RGB images of equal height side by side, with white borders, below a title."""
     framed = [
         cv2.copyMakeBorder(i, 0, BORDER, 0, BORDER, cv2.BORDER_CONSTANT, value=(255,) * 3)
         for i in images
@@ -86,14 +86,14 @@ def titled_row(images: Iterable[Image], title: str) -> Image:
 
 
 def shrunk(image: Image, width: int) -> Image:
-    """An image of 4:3 at another width."""
+    """An image with aspect ratio 4:3, scaled to another width."""
     size = (width, 3 * width // 4)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 _SCENES = ("living_room", "corridor", "window", "table", "wall", "carpet")
-_FAR_M = 4.0  # of the depth that is drawn
-_SHEET_WIDTH = 200  # of an image, pixels
+_FAR_M = 4.0  # largest depth drawn
+_SHEET_WIDTH = 200  # width of an image, pixels
 _STARTS_TRIED = 12
 
 
@@ -108,7 +108,7 @@ def scenes_picture() -> Image:
 
 
 def _kinds_of(scene: Scene) -> tuple[Image, Image, Image]:
-    """Colour, depth and normals (H, W, 3) from the start pose that shows most objects."""
+    """Colour, depth and normals (H, W, 3) from the start pose that shows the most objects."""
     sensor = RGBDSensor(scene, xtion("640x480"), noise="none")
     rng = np.random.default_rng(scene.seed)
     seen = [sensor.ground_truth(scene.sample_start(rng)) for _ in range(_STARTS_TRIED)]
@@ -121,15 +121,15 @@ def _kinds_of(scene: Scene) -> tuple[Image, Image, Image]:
 
 
 _HOMES = (2000, 2002)  # seeds
-_VIEWS, _VIEW_WIDTH = 6, 180  # of each home; pixels
-_EYE_M = 80.0  # of the eye above a plan, which makes it nearly parallel
+_VIEWS, _VIEW_WIDTH = 6, 180  # views of each home; their width in pixels
+_EYE_M = 80.0  # height of the eye above a plan, for a nearly parallel projection
 _MARGIN_M = 0.25
 _ABOVE = ("ceiling", "lamp")  # last words of the labels that a plan leaves out
 _CANDIDATES = 4
 
 
 def homes_picture() -> Image:
-    """Plans of homes, each with two rows of views beside it."""
+    """Floor plans of homes, each beside two rows of views."""
     rows = []
     columns, height = -(-_VIEWS // 2), 3 * _VIEW_WIDTH // 2
     for seed in _HOMES:
@@ -145,12 +145,12 @@ def homes_picture() -> Image:
 
 
 def floor_plan(scene: HomeScene, width: int, height: int) -> Image:
-    """The rooms from above and their names, (height, width, 3) RGB, y up or to the left."""
+    """The rooms from above with their names, (height, width, 3) RGB, y up or to the left."""
     low = np.min([room.low for room in scene.plan.rooms], axis=0) - _MARGIN_M
     high = np.max([room.high for room in scene.plan.rooms], axis=0) + _MARGIN_M
     is_turned = (high - low)[0] < (high - low)[1]
     extent = (high - low)[::-1] if is_turned else high - low
-    scale = min(width / extent[0], height / extent[1])  # pixels a metre
+    scale = min(width / extent[0], height / extent[1])  # pixels per metre
     eye = np.eye(4)
     eye[:3, :3] = np.diag([1.0, -1.0, -1.0])
     if is_turned:
@@ -172,7 +172,7 @@ def floor_plan(scene: HomeScene, width: int, height: int) -> Image:
 
 
 def _without_ceilings(scene: HomeScene) -> HomeScene:
-    """The scene as one looks into it from above."""
+    """The scene without ceilings, to look into it from above."""
     mesh = scene.mesh
     above = [k for k, name in enumerate(mesh.labels) if name.split(" ")[-1] in _ABOVE]
     kept = ~np.isin(mesh.face_label, above)
@@ -184,7 +184,7 @@ def _without_ceilings(scene: HomeScene) -> HomeScene:
 
 
 def _views_of(scene: HomeScene) -> list[Image]:
-    """Colour images (H, W, 3) from start poses that show many objects, one a room at first."""
+    """Colour images (H, W, 3) from start poses that show many objects, first one per room."""
     sensor = RGBDSensor(scene, xtion("640x480"), noise="none")
     rng = np.random.default_rng(scene.seed)
     by_room: dict[str, list[tuple[int, Image]]] = {}
@@ -207,7 +207,7 @@ _TILES_A_ROW = 4
 
 
 def usme_picture(seed: int = 2000) -> Image:
-    """Two frames of each of the eight sequences of USME, one above the other."""
+    """Two frames, one above the other, of each of the eight USME sequences."""
     made: dict[str, Scene] = {}
     tiles = []
     for entry in SUITE:
@@ -223,27 +223,27 @@ def usme_picture(seed: int = 2000) -> Image:
 
 
 _ARM_SEEDS = {"table": 1003, "wall": 1002, "carpet": 1004, "living_room": 1000}
-"""Scenes in which the camera sees more than one flat colour."""
-_ARM_MOVES, _ARM_WIDTH = 3, 320  # random motions from the start; pixels of an image
-_FILL = 1.25  # distance of the near view in diagonals of the box around the arm
-_FARTHER_M = 0.9  # the far view
-_AZIMUTHS, _HEIGHTS = 24, (0.15, 0.45, 0.75)  # of the viewpoints tried; heights per distance
-_WALL_GAP_M = 0.15  # that a viewpoint keeps from everything
-_SMOOTH = 2  # pixels rendered for one shown, each way
-_GAZE_M = 1.0  # the far view shows what the camera looks at, up to there
-_HIDDEN_M = 0.1  # nearer than this to what hides it, a point is still called seen
+"""Scenes and seeds for which the camera sees more than one flat colour."""
+_ARM_MOVES, _ARM_WIDTH = 3, 320  # random motions from the start; width of an image in pixels
+_FILL = 1.25  # distance of the close view, in diagonals of the box around the arm
+_FARTHER_M = 0.9  # additional distance of the far view
+_AZIMUTHS, _HEIGHTS = 24, (0.15, 0.45, 0.75)  # viewpoints tried; heights relative to distance
+_WALL_GAP_M = 0.15  # distance of a viewpoint from everything
+_SMOOTH = 2  # rendered pixels per shown pixel, in each direction
+_GAZE_M = 1.0  # the far view includes the point the camera looks at, up to this distance
+_HIDDEN_M = 0.1  # a point at most this far behind a surface still counts as visible
 
 LABEL = "arm"
 _AMBIENT, _DIRECT, _SECOND = 0.35, 0.65, 0.25
-_TO_LIGHT = np.array([0.35, -0.3, 0.89])  # a ceiling lamp somewhat to the side
-_TO_SECOND = np.array([-0.8, 0.55, 0.25])  # and light from the walls
-_BRIGHTNESS = 0.9  # a white surface that faces the light, in units of the sensor's white
+_TO_LIGHT = np.array([0.35, -0.3, 0.89])  # direction to a ceiling lamp, slightly to the side
+_TO_SECOND = np.array([-0.8, 0.55, 0.25])  # direction to light from the walls
+_BRIGHTNESS = 0.9  # of a white surface facing the light, in units of the sensor's white
 
 
 def arm_picture(
     seeds: dict[str, int] = _ARM_SEEDS, moves: int = _ARM_MOVES, width: int = _ARM_WIDTH
 ) -> Image:
-    """The arm in scenes by name, and what its camera sees, a row each."""
+    """The arm in each scene and its camera's view, one row per scene."""
     rows = []
     for name, seed in seeds.items():
         scene, rng = scenes.make(name, seed), np.random.default_rng(seed)
@@ -257,7 +257,7 @@ def arm_picture(
 
 
 def arm_views(scene: Scene, arm: KinematicArm, width: int) -> tuple[Image, Image, Image]:
-    """The arm from afar and near, and the view of its camera, each (3/4 width, width, 3)."""
+    """Far and close view of the arm, and its camera's view, each (3/4 width, width, 3)."""
     base = arm.T_world_base[:3, 3]
     parts = arm_parts(arm.model, arm.q, arm.T_world_base)
     shown = scene_with(scene, parts + column_parts(base, floor_below(scene, base)))
@@ -280,7 +280,7 @@ def arm_views(scene: Scene, arm: KinematicArm, width: int) -> tuple[Image, Image
 def _view(
     scene: Scene, shown: Scene, target: Float64, distance: float, width: int, also: Float64 | None
 ) -> Image:
-    """Around ``target`` (3,), from the side that shows most of the arm, and ``also`` a point."""
+    """View of ``target`` (3,) from the side that shows most of the arm, and the point ``also``."""
     angles = np.linspace(0, 2 * np.pi, _AZIMUTHS, endpoint=False)
     offsets = np.array([(np.cos(a), np.sin(a), h) for h in _HEIGHTS for a in angles])
     offsets *= distance / np.linalg.norm(offsets, axis=1, keepdims=True)
@@ -303,7 +303,7 @@ def _view(
 
 
 def _is_seen(point: Float64, pose: Float64, camera: Intrinsics, depth: NDArray[Any]) -> bool:
-    """Whether nothing hides a point (3,), well inside the picture, from a camera at ``pose``."""
+    """Whether a camera at ``pose`` sees a point (3,) unoccluded and well inside the picture."""
     local = transform_points(invert(pose), point[None])
     if local[0, 2] <= 0:
         return False
@@ -319,9 +319,9 @@ def _outside_camera(width: int) -> Intrinsics:
 
 
 def scene_with(scene: Scene, parts: list[Part]) -> Scene:
-    """A copy of ``scene`` that shows ``parts`` too; they cast no shadow.
+    """A copy of ``scene`` that also shows ``parts``, which cast no shadow.
 
-    The light on them is made up: a lamp above, light from the side, and a share from everywhere.
+    Their light is synthetic: a lamp above, light from the side, and ambient light.
     """
     corners = np.concatenate([part.corners for part in parts])
     normals = np.concatenate([part.normals for part in parts])
@@ -365,22 +365,22 @@ PICTURES: dict[str, Callable[[], Image]] = {
 
 @dataclass(frozen=True)
 class Options:
-    """Draw pictures of the pages."""
+    """Draw the pictures of the pages."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = tuple(PICTURES)
-    """scenes, homes, usme, arm."""
+    """Pictures to draw: scenes, homes, usme, arm."""
     out: Path = Path("docs/pictures")
-    """Folder that NAME.webp is written to."""
+    """Folder for NAME.webp."""
 
     def __post_init__(self) -> None:
-        """Refuse names of no picture."""
+        """Refuse unknown names of pictures."""
         for name in self.names:
             if name not in PICTURES:
                 raise unknown("picture", name, PICTURES)
 
 
 def save(options: Options) -> str:
-    """Write the pictures; return what was done."""
+    """Write the pictures; return a line that describes them."""
     for name in options.names:
         save_image(options.out / f"{name}.webp", PICTURES[name]())
     return ", ".join(options.names)

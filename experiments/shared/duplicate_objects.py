@@ -26,14 +26,14 @@ from ms_slam_env.sensor.scene_cache import get_scene
 
 @dataclass(frozen=True)
 class LabelledView:
-    """A frame that is part of a map, with what it really showed.
+    """A frame that is part of a map, with the true labels of its pixels.
 
     Attributes:
-        T_world_camera: (4, 4) where the camera truly was.
-        T_world_camera_estimate: (4, 4) where SLAM put it.
+        T_world_camera: (4, 4) true pose.
+        T_world_camera_estimate: (4, 4) pose estimated by SLAM.
         color: (H, W, 3) uint8.
-        depth: (H, W) metres along the optical axis, 0 = nothing.
-        labels: (H, W) int, the object that each pixel really shows; negative = none.
+        depth: (H, W) metres along the optical axis, 0 = no reading.
+        labels: (H, W) int, the object that each pixel truly shows; negative = none.
     """
 
     T_world_camera: Float64
@@ -44,19 +44,19 @@ class LabelledView:
 
     @property
     def T_true_map(self) -> Float64:
-        """(4, 4) motion that takes what this frame put into the map to its true place."""
+        """(4, 4) motion that moves this frame's part of the map to its true place."""
         return self.T_world_camera @ invert(self.T_world_camera_estimate)
 
 
 @dataclass(frozen=True)
 class SightingRule(Checked):
-    """When a view sees a point of the map.
+    """Conditions under which a view sees a point of the map.
 
     Attributes:
-        depth_slack_m: the view's depth agrees with the point's to this, at 1 m; grows with depth
-            squared like the sensor's noise.
-        color_slack: and its colour to this, in grey levels of the channel that differs most.
-        range_m: nothing farther away is counted.
+        depth_slack_m: largest difference between the view's depth and the point's at 1 m; grows
+            with depth squared, like the sensor noise.
+        color_slack: largest difference of colour, in grey levels of the channel that differs most.
+        range_m: points farther away are ignored.
     """
 
     depth_slack_m: float = bounded(0.02, 1e-4, 1.0)
@@ -72,24 +72,24 @@ def count_votes(
     num_labels: int,
     rule: SightingRule | None = None,
 ) -> Int64:
-    """How many views saw each point on each object, (N, num_labels).
+    """Number of views that saw each point on each object, (N, num_labels).
 
     A view sees a point if the point, projected with the view's *estimated* pose, lies in the image
-    at the depth and with the colour that the view has there; it votes for the object that the pixel
-    *truly* shows. A point whose colour no view has, being a mixture of several, is judged by depth
-    alone.
+    and matches the view's depth and colour there. The view then votes for the object that the pixel
+    *truly* shows. A point whose colour matches no view, because it mixes several, is judged by
+    depth alone.
 
     Args:
-        points: (N, 3) of the map, world frame.
-        colors: (N, 3) of the points, 0 to 255.
-        views: of the intrinsics' size.
-        intrinsics: of the views.
+        points: (N, 3) map points, world frame.
+        colors: (N, 3) their colours, 0 to 255.
+        views: views with images of the intrinsics' size.
+        intrinsics: intrinsics of the views.
         num_labels: labels are in [0, num_labels).
-        rule: gives the slacks and the range.
+        rule: tolerances and range.
 
     Raises:
-        InputError: bad points, colours that do not fit them, views of another size, or a label out
-            of range.
+        InputError: bad points, colours of another number, views of another size, or a label out of
+            range.
     """
     rule = rule or SightingRule()
     cloud, shades = check_points(points, "points"), np.asarray(colors, dtype=np.float64)
@@ -113,7 +113,7 @@ def count_votes(
 def _seen(
     cloud: Float64, view: LabelledView, intrinsics: Intrinsics, rule: SightingRule
 ) -> tuple[Int64, tuple[Int64, Int64]]:
-    """Points that the view has at their depth: indices (K,), rows and columns of their pixels."""
+    """Points that match the view's depth: indices (K,), and rows and columns of their pixels."""
     camera = transform_points(invert(view.T_world_camera_estimate), cloud)
     index = np.flatnonzero((camera[:, 2] > 1e-3) & (camera[:, 2] <= rule.range_m))
     column, row = np.rint(intrinsics.project(camera[index])).T
@@ -129,10 +129,11 @@ def _seen(
 def distinct_placements(
     views: Sequence[LabelledView], points: ArrayLike, apart_m: float
 ) -> Float64:
-    """Motions T_true_map (K, 4, 4) of the views, each unlike the ones before it.
+    """Distinct motions T_true_map (K, 4, 4) of the views.
 
-    Two are alike if they place no corner of the box around ``points`` (N, 3) as far as
-    ``apart_m`` apart. The first one is the identity: the map as it is.
+    Two motions count as the same if they move every corner of the box around ``points`` (N, 3) to
+    places less than ``apart_m`` apart. The first motion is the identity, which leaves the map
+    unchanged.
 
     Raises:
         InputError: bad points.
@@ -150,18 +151,18 @@ def distinct_placements(
     return np.stack(found)
 
 
-_POINTS_TO_PLACE = 1500  # of an object, evenly picked, decide where it fits best
+_POINTS_TO_PLACE = 1500  # evenly picked points of an object, to find its best placement
 
 
 @dataclass(frozen=True)
 class ConsistencyRule(Checked):
-    """When an object counts as present twice.
+    """Conditions under which an object counts as shown twice.
 
     Attributes:
-        apart_m: a point this far from its object's true surface lies apart from it.
-        share: an object is there twice if more than this share of its points lies apart.
+        apart_m: a point farther than this from its object's true surface is off the surface.
+        share: an object is shown twice if more than this share of its points is off the surface.
         min_points: an object with fewer points is too small to judge.
-        support: a point was seen on an object if at least this share of its views say so.
+        support: a point belongs to an object if at least this share of its views vote for it.
     """
 
     apart_m: float = bounded(0.04, 1e-4, 10.0)
@@ -175,12 +176,12 @@ class ObjectConsistency:
     """One object of the map.
 
     Attributes:
-        label: of the object.
-        points: of the map that were seen on it.
-        apart_share: of them that lie apart from its true surface, the object being placed, as a
-            whole, where it fits best.
-        misplaced_share: of them that do where the map has it.
-        duplicated: whether it counts as present twice.
+        label: label of the object.
+        points: number of map points seen on it.
+        apart_share: share of them off its true surface when the object as a whole is placed where
+            it fits best.
+        misplaced_share: share of them off its true surface where the map has it.
+        duplicated: whether it counts as shown twice.
     """
 
     label: int
@@ -195,8 +196,8 @@ class MapConsistency:
     """Verdict on a map.
 
     Attributes:
-        objects: those with enough points to judge, by label.
-        apart: (N,) bool, the points that are second copies of what they were seen on.
+        objects: objects with enough points to judge, by label.
+        apart: (N,) bool, the points that are second copies of an object's surface.
     """
 
     objects: tuple[ObjectConsistency, ...]
@@ -204,13 +205,13 @@ class MapConsistency:
 
     @property
     def duplicated(self) -> tuple[ObjectConsistency, ...]:
-        """The objects that are there twice, the worst first."""
+        """The objects shown twice, worst first."""
         found = [item for item in self.objects if item.duplicated]
         return tuple(sorted(found, key=lambda item: -item.apart_share))
 
     @property
     def success(self) -> bool:
-        """Whether no object is there twice."""
+        """Whether no object is shown twice."""
         return not any(item.duplicated for item in self.objects)
 
 
@@ -224,16 +225,16 @@ def judge_consistency(
 ) -> MapConsistency:
     """Find the objects that a map shows twice.
 
-    An object that the map shows once, but shifted, is no duplicate, and who looks at a map cannot
-    know its true place: each object is judged in that one of the ``placements`` that leaves the
-    fewest of its points apart from its surface. No motion of the whole reconciles two copies.
+    An object that is shown once, but shifted, is not a duplicate, since a viewer of the map cannot
+    know its true place. Each object is therefore judged in the one of the ``placements`` that
+    leaves the fewest of its points off its surface. No rigid motion reconciles two copies.
 
     Args:
-        points: (N, 3) of the map, world frame, evenly spread (one a voxel), so that a surface
+        points: (N, 3) map points, world frame, evenly spread (one per voxel), so that a surface
             counts by its area.
-        votes: (N, L) how many views saw each point on each object, see
+        votes: (N, L) number of views that saw each point on each object, see
             :func:`count_votes`.
-        surface: (M, 3) of the true surface.
+        surface: (M, 3) points of the true surface.
         surface_labels: (M,) object of each true point.
         rule: the thresholds.
         placements: (K, 4, 4) motions of an object as a whole; only the identity if None.
@@ -273,7 +274,7 @@ def judge_consistency(
 def _best_placed(
     points: Float64, tree: cKDTree, distance_m: float, motions: list[Float64], as_it_is: Bool
 ) -> Bool:
-    """Which points (N,) lie apart where the object fits best, or ``as_it_is`` if that is best."""
+    """Mask (N,) of points off the surface in the best placement; ``as_it_is`` if none is better."""
     some = points[np.unique(np.linspace(0, len(points) - 1, _POINTS_TO_PLACE).astype(int))]
     shares = [_beyond(transform_points(T, some), tree, distance_m).mean() for T in motions]
     if not shares:
@@ -283,8 +284,8 @@ def _best_placed(
 
 
 def _beyond(points: Float64, tree: cKDTree, distance_m: float) -> Bool:
-    """Which points (N,) are farther than ``distance_m`` from all points of the tree."""
-    # With a bound the search gives up early on points that are far away; those are at infinity.
+    """Mask (N,) of the points farther than ``distance_m`` from all points of the tree."""
+    # With a bound, the search stops early for distant points and returns infinity.
     return np.isinf(tree.query(points, distance_upper_bound=distance_m)[0])
 
 
@@ -296,8 +297,8 @@ class JudgedMap:
     """A map and the verdict on it.
 
     Attributes:
-        points: (N, 3) of the map that were judged, world frame.
-        colors: (N, 3) uint8, theirs.
+        points: (N, 3) judged map points, world frame.
+        colors: (N, 3) uint8, their colours.
         consistency: the verdict.
         labels: names of the scene's objects.
     """
@@ -328,7 +329,7 @@ class JudgedMap:
 def labelled_view(
     sensor: RGBDSensor, T_world_camera: Float64, T_world_camera_estimate: Float64
 ) -> LabelledView:
-    """What a frame from a true pose (4, 4) showed, for SLAM that put it at an estimated one."""
+    """Labelled view from a true pose (4, 4) that SLAM placed at an estimated pose."""
     view = sensor.ground_truth(T_world_camera)
     return LabelledView(
         T_world_camera, T_world_camera_estimate, view.color, view.depth, view.labels
@@ -342,7 +343,7 @@ def judge_map(
     sensor: RGBDSensor,
     rule: ConsistencyRule | None = None,
 ) -> JudgedMap:
-    """Judge a map, points (N, 3) and colours (N, 3), made of ``views`` of the sensor's scene.
+    """Judge a map, points (N, 3) with colours (N, 3), made from ``views`` of the sensor's scene.
 
     An empty map shows nothing twice.
     """
@@ -365,8 +366,8 @@ def judge_map(
 def labelled_surface(scene: str, seed: int) -> tuple[Float64, NDArray[np.int32]]:
     """The whole surface of a scene: points (N, 3) and the object (N,) of each.
 
-    Also what ``Scene.surface_points`` leaves out as hidden: cameras do see into the narrow places
-    that it takes for closed, and to a seat's inner side.
+    Includes surface that ``Scene.surface_points`` leaves out as hidden, because cameras can see
+    into narrow places that it considers closed, and the inner side of a seat.
     """
     mesh = get_scene(scene, seed).mesh
     points, face = sample_surface(mesh.vertices, mesh.faces, SURFACE_SPACING_M)

@@ -1,4 +1,4 @@
-"""Motions and recorded depth of ICL-NUIM's living room, from a folder that holds them.
+"""Read motions and recorded depth of ICL-NUIM's living room from a folder.
 
 Handa et al., ICRA 2014: ``icl_nuim/trajectories/lr_kt0.tum.txt`` and so on, and
 ``icl_nuim/lr_kt3_depth``.
@@ -43,14 +43,14 @@ def read_motions(data: str, names: Sequence[str]) -> tuple[list[Float64], Float6
 
 
 def recorded_depth(data: str, image_size: str, every: int) -> Recording:
-    """Every so many frames of the recorded depth, at most as large as ``image_size``."""
+    """Every ``every``-th frame of the recorded depth, at most as large as ``image_size``."""
     recording = open_recording(Path(data) / f"icl_nuim/{RECORDED}_depth").every(every)
     is_larger = rendered_size(image_size)[0] < recording.source.width
     return recording.at_size(image_size) if is_larger else recording
 
 
 def recorded_motion(data: str, image_size: str, every: int) -> RecordedSequence:
-    """The recorded depth, each frame with the true pose nearest in time."""
+    """The recorded depth, each frame with the true pose closest in time."""
     recording = recorded_depth(data, image_size, every)
     times, poses = read_motion(data, RECORDED)
     nearest = np.abs(times[:, None] - recording.timestamps).argmin(axis=0)

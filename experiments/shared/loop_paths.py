@@ -1,4 +1,4 @@
-"""Camera paths that leave a place, see no more of it for long, and come back to it."""
+"""Camera paths that leave a place, do not see it for a long time, and return to it."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ HEIGHT_M = 1.3
 CLEARANCE_M = 0.35  # free space kept around the camera
 STARTS = 64  # places tried for the middle of a room
 ORBITS_M = (0.9, 0.7, 0.5)
-"""Radii of a path around an object, the first that fits."""
-_OBJECT_M = 0.4  # around the axis of such a path, for its object
+"""Radii of a path around an object; the first that fits is used."""
+_OBJECT_M = 0.4  # radius around the path's axis in which the object lies
 _ORBIT_CLEARANCE_M = 0.15
 _ORBIT_GRID_M = 0.25
 PATHS = ("around", "corridor", "handheld")
 HANDHELD_FRAMES = 600
-OVERLAP_TURNS = 0.3  # how far a path goes on over ground that it has seen
+OVERLAP_TURNS = 0.3  # turns that a path continues after it has closed
 
 
 def around_room(scene: Scene, seed: int, step_m: float = 0.02, step_deg: float = 1.5) -> Float64:
-    """Poses (N, 4, 4) of a camera that walks a circle in the freest place and looks outwards.
+    """Poses (N, 4, 4) of a camera that moves in a circle in the freest place and looks outwards.
 
-    It turns once and OVERLAP_TURNS more, so the first view comes back after a whole turn.
+    It makes one turn and OVERLAP_TURNS more, so the first view returns after a whole turn.
 
     Args:
-        scene: where.
-        seed: of the direction to start in, and how the gaze goes up and down.
+        scene: scene of the path.
+        seed: seed of the initial direction, and of how the gaze moves up and down.
         step_m: largest translation from frame to frame.
         step_deg: largest rotation from frame to frame.
 
     Raises:
-        InputError: there is no such place.
+        InputError: there is no suitable place.
     """
     rng = np.random.default_rng([seed, 5])
     starts = np.stack([scene.sample_start(rng)[:3, 3] for _ in range(STARTS)])
@@ -89,20 +89,21 @@ def along_corridor(scene: Scene, seed: int, step_m: float = 0.02, step_deg: floa
 def around_object(
     scene: Scene, seed: int, laps: int = 3, step_m: float = 0.04, step_deg: float = 3.0
 ) -> tuple[Float64, int]:
-    """Poses (N, 4, 4) of a camera that orbits what stands in the middle, and the frames of a lap.
+    """Poses (N, 4, 4) of a camera that orbits an object, and the number of frames of a lap.
 
-    As USME wants it for relocalisation, section 1.3 (2): "steadily around a textured object, a few
-    times". Of the free circles the one around most surface below the camera, at which it looks.
+    As in USME's relocalisation test, section 1.3 (2): "steadily around a textured object, a few
+    times". Of the free circles, it uses the one around the most surface below the camera, and looks
+    at that surface.
 
     Args:
-        scene: where.
-        seed: of the direction to start in.
-        laps: turns around it.
+        scene: scene of the path.
+        seed: seed of the initial direction.
+        laps: number of turns around the object.
         step_m: largest translation from frame to frame.
         step_deg: largest rotation from frame to frame.
 
     Raises:
-        InputError: nothing that the camera could go around.
+        InputError: there is no object that the camera could orbit.
     """
     points = scene.surface_points(0.05)[0]
     low, high = points.min(axis=0), points.max(axis=0)
@@ -132,7 +133,7 @@ def around_object(
 
 
 def _at_speed(eyes: Float64, gaze: Float64, step_m: float, step_deg: float) -> Float64:
-    """Poses along densely sampled eyes and directions (M, 3), as fast as the limits permit."""
+    """Poses along densely sampled positions and directions (M, 3), as fast as the limits allow."""
     dense = np.stack([look_at(eye, eye + aim) for eye, aim in zip(eyes, gaze, strict=True)])
     frames = frame_times(dense, step_m, np.radians(step_deg))
     at = np.arange(0.0, frames[-1])
@@ -141,7 +142,7 @@ def _at_speed(eyes: Float64, gaze: Float64, step_m: float, step_deg: float) -> F
 
 
 def returning_path(scene: Scene, path: str, seed: int, step_m: float, step_deg: float) -> Float64:
-    """Poses (N, 4, 4) of the path of a name, one of `PATHS`, ``handheld`` being a loop of its kind.
+    """Poses (N, 4, 4) of a path named in `PATHS`; ``handheld`` is a closed hand-held loop.
 
     Raises:
         InputError: an unknown path, or none in this scene.

@@ -1,4 +1,4 @@
-"""Samplers compared in memory: a grid whose points are measured once, and studies in memory."""
+"""Compare samplers in memory, on a grid whose points are measured only once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ms_slam_env.tuning.space import SearchSpace
 
 @dataclass(frozen=True)
 class _Point:
-    """A point of the grid with everything that decides its measurement."""
+    """A point of the grid with everything that determines its measurement."""
 
     evaluator: SlamEvaluator
     base: dict[str, Any]
@@ -28,14 +28,14 @@ class _Point:
 
 
 class Grid:
-    """Measures the point of a grid that is nearest to the values asked for, each point once.
+    """Measures the grid point closest to the requested values; each point only once.
 
     Args:
-        space: ranges; no choices.
+        space: ranges, without choices.
         evaluator: measures a point.
-        count: points along each parameter, the default among them; ranges of integers may hold
+        count: points along each parameter, including the default; ranges of integers may have
             fewer.
-        path: of what has been measured.
+        path: file of the measurements.
 
     Raises:
         InputError: a parameter without an order.
@@ -50,7 +50,7 @@ class Grid:
         self._known = self._records.load()
 
     def nearest(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """The point of the grid nearest to ``values``; on a logarithmic range, in ratio."""
+        """The grid point closest to ``values``, by ratio on logarithmic ranges."""
         point = {}
         for name, value in values.items():
             levels = np.array([*self.levels[name], value], dtype=np.float64)
@@ -59,7 +59,7 @@ class Grid:
         return point
 
     def __call__(self, values: Mapping[str, Any]) -> Row:
-        """What was measured at the point nearest to ``values``."""
+        """Measurement at the grid point closest to ``values``."""
         point = self.nearest(values)
         key = spec_key(_Point(self.evaluator, asdict(self.space.base), point))
         if key not in self._known:
@@ -80,7 +80,7 @@ class Grid:
 
 
 def _levels(space: SearchSpace, name: str, count: int) -> list[Any]:
-    """Values of a parameter in order; the one nearest to the default is the default itself."""
+    """Values of a parameter in order; the one closest to the default is replaced by it."""
     kind = _range(space, name)
     default = space.defaults()[name]
     spaced = (np.geomspace if kind.log else np.linspace)(kind.low, kind.high, count)
@@ -97,7 +97,7 @@ def _range(space: SearchSpace, name: str) -> Float | Integer:
     return kind
 
 
-_POPULATION = 10  # of NSGA-II: several generations within a budget of tens
+_POPULATION = 10  # of NSGA-II, for several generations within tens of trials
 
 
 def explore_in_memory(
@@ -113,15 +113,15 @@ def explore_in_memory(
 
     Args:
         space: the parameters.
-        measure: values of the parameters in, what was measured out.
+        measure: function from parameter values to measurements.
         objectives: names in ``METRICS``, two or more.
         sampler: name in ``SAMPLERS``.
-        seed: of the sampler.
+        seed: seed of the sampler.
         trials: number of trials.
-        reference: where each objective stops to count; None for the worst there is.
+        reference: largest value of each objective that counts; None for the worst possible.
 
     Returns:
-        the values of the parameters and what was measured, trial by trial.
+        parameter values and measurements of each trial.
     """
     import optuna
 

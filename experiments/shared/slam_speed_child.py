@@ -1,7 +1,7 @@
 """One process of the speed measurement: times the surfel SLAM on a stored sequence.
 
-A script of its own: ``slam_speed`` runs it with the package of this checkout, and with that of
-another one to compare with. So it uses only what has been in the package for long.
+``slam_speed`` runs this file with the package of this checkout, and with that of another checkout
+for comparison. Therefore it uses only long-standing parts of the package.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ STAGES = {
     "track": (("tracker", "set_frame"), ("tracker", "align")),
     "fuse": (("map", "fuse"),),
 }
-"""Stage to the methods (paths from the SLAM) that do its work."""
-APART_M = 40.0  # distance between stored places: far beyond what the camera sees
+"""Stage to the methods (attribute paths of the SLAM object) that do its work."""
+APART_M = 40.0  # distance between stored places, far beyond the camera's range
 
 
 class StageClock:
-    """Adds up the processor time of the stages of one SLAM, on a CPU, where launches block."""
+    """Sums the processor time of each stage of SLAM, on a CPU, where kernel launches block."""
 
     def __init__(self, slam: BatchedSurfelSlam) -> None:
         """Put a clock around every method of ``STAGES``."""
@@ -54,10 +54,10 @@ class StageClock:
 
 
 def with_far_places(state: dict[str, Any], stored: int, stable: float) -> dict[str, Any]:
-    """State of a SLAM that has seen other places before, ``stored`` surfels in all.
+    """SLAM state with other places in its map, with ``stored`` surfels in total.
 
-    The other places are turned copies of the map itself, far away, and older in the map, as they
-    would be for a robot that came from there. Their surfels are stable, or they would be removed.
+    The other places are rotated copies of the map, far away and older, as for a robot that came
+    from there. Their surfels are marked stable, or they would be removed.
     """
     surfels = state["map"]["surfels"][0]
     here = len(surfels["radius"])
@@ -95,7 +95,7 @@ def measure(
     """Time every frame after the warm-up, once for each number of stored surfels."""
     with np.load(sequence) as data:
         color, depth, poses = data["color"], data["depth"], data["poses"]
-    # Far from crowded: a crowded map is busy with making room.
+    # With spare capacity, since a full map spends time on making room.
     capacity = max(400_000, max(stored) * 5 // 4 + 8 * depth[0].size)
     config = SurfelConfig(**{"max_surfels": capacity, **backend})
     slam = BatchedSurfelSlam(1, xtion(size), config)

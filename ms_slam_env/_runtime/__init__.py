@@ -1,1 +1,1 @@
-"""Below all stages: files in and out, processes, interrupts, Warp, extension points."""
+"""Infrastructure below all other parts: files, processes, interrupts, Warp, extension points."""

@@ -1,4 +1,4 @@
-"""Array types that signatures name; shapes stand beside them."""
+"""Array types for signatures; docstrings give the shapes."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Command lines from dataclasses: errors of one line, exit code 2 for bad input."""
+"""Command lines from dataclasses, with one-line errors and exit code 2 for bad input."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from ms_slam_env.errors import InputError, InputWarning, one_line
 
 T = TypeVar("T")
 
-_FRAME = re.compile(r"[╭╮╰╯│─]+|-{4,}")  # dashes where the terminal is not UTF-8
-_CLASS = re.compile(r"^Error parsing \w+: ")  # names our dataclass, which tells a user nothing
+_FRAME = re.compile(r"[╭╮╰╯│─]+|-{4,}")  # dashes if the terminal is not UTF-8
+_CLASS = re.compile(r"^Error parsing \w+: ")  # names our dataclass, which does not help users
 _PROPOSAL = re.compile(r"^[│ ] +(--[a-z][\w-]*)", re.MULTILINE)
 
 
@@ -36,15 +36,15 @@ def parse(
 ) -> T:
     """Build dataclass ``cls`` from command-line ``arguments`` (the process's own if None).
 
-    What they do not say is as in ``default``, by default as the dataclass has it. Its field
-    ``out``, where it has one, is checked by ``check_out``.
+    Options not given have the values of ``default`` or, without it, the dataclass's defaults.
+    ``check_out`` checks the field ``out``, if there is one.
 
     Raises:
-        InputError: arguments that do not fit; what tyro says in a box, in one line. Or an ``out``
-            that nothing can be written to.
+        InputError: invalid arguments, with tyro's message in one line; or an ``out`` that cannot be
+            written to.
         SystemExit: with code 0 after ``--help``.
     """
-    import tyro  # here, so that a list of the commands does not wait for it
+    import tyro  # here, so that listing the commands does not wait for it
 
     complaint = io.StringIO()
     try:
@@ -62,18 +62,18 @@ def parse(
 
 
 def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
-    """Run a command; errors and interrupts in one line.
+    """Run a command; report errors, interrupts and warnings about input in one line each.
 
-    So are warnings about what was given; those of libraries tell a user nothing.
+    Hides warnings of libraries, which do not help users.
 
     Returns:
         0 success, 1 failure (also of the disk), 2 bad input, 130 after Ctrl-C, 143 after SIGTERM,
-        141 where nobody reads the output any more, which is what a pipe makes of other programs.
+        141 if nobody reads the output any more, as for other programs in a pipe.
     """
     _open_missing_streams()
     interrupts = Interrupts()
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # names of files need not be text
+        sys.stdout.reconfigure(errors="backslashreplace")  # file names need not be valid text
     try:
         with interrupts, warnings.catch_warnings():
             if not sys.warnoptions:
@@ -94,7 +94,7 @@ def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
         if ending is None:
             raise
         code, text = ending
-        with contextlib.suppress(OSError):  # a message that no one reads changes no exit code
+        with contextlib.suppress(OSError):  # an unread message must not change the exit code
             _close_bars()
             print(f"{name}: {one_line(text)}", file=sys.stderr)
         _no_one_reads()
@@ -102,26 +102,26 @@ def exit_code(run: Callable[[], int], name: str = "ms-slam") -> int:
 
 
 def _open_missing_streams() -> None:
-    """Give a process that was started with closed standard streams ones that lead nowhere.
+    """Open standard streams that were closed at the start of the process, to the null device.
 
-    Python has None for them, which not all code expects; and the next file to be opened would get
-    the number of one, and everything that a library writes there.
+    Python sets closed streams to None, which not all code expects. Also, the next file opened would
+    get the stream's number, and everything that a library writes there.
     """
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, as long as the process
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, open until the process ends
 
 
 def _no_one_reads() -> bool:
-    """Whether an output is a pipe whose reader has gone; what is left for it goes nowhere."""
+    """Whether an output is a pipe whose reader has gone; its remaining data is discarded."""
     gone = []
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # a stream without a file
             outputs = select.poll()
-            outputs.register(stream.fileno(), 0)  # asks for errors alone
+            outputs.register(stream.fileno(), 0)  # errors only
             gone += [stream] if outputs.poll(0) else []
     for stream in gone:
         _lead_nowhere(stream)
@@ -129,22 +129,22 @@ def _no_one_reads() -> bool:
 
 
 def _lead_nowhere(stream: IO[str]) -> None:
-    """Let what is left in a stream that takes nothing more cause no error at the exit."""
+    """Discard data left in a broken stream, so that it causes no error at exit."""
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def _close_bars() -> None:
-    """End progress bars that an error left open: else they are drawn anew, below its message."""
+    """Close progress bars that an error left open, or they would be redrawn below its message."""
     library = sys.modules.get("tqdm")
     for bar in list(getattr(library.tqdm, "_instances", ())) if library else ():
         bar.close()
 
 
 def _ending(error: BaseException, stopped: int | None) -> tuple[int, str] | None:
-    """Exit code and message of what ended a command; None if it is an error of the program."""
+    """Exit code and message for the error that ended a command; None if it is a program bug."""
     if stopped is not None or isinstance(error, KeyboardInterrupt):
-        # After a signal anything may come out of a library that was in the middle of something.
+        # After a signal, an interrupted library may raise anything.
         kept = str(error) if isinstance(error, KeyboardInterrupt) else ""
         number = stopped or (signal.SIGTERM if isinstance(error, Terminated) else signal.SIGINT)
         by = " by SIGTERM" if number == signal.SIGTERM else ""
@@ -162,7 +162,7 @@ def _ending(error: BaseException, stopped: int | None) -> tuple[int, str] | None
 
 
 def _flush() -> None:
-    """Let a standard output that takes nothing more be an error now, not after the exit code."""
+    """Flush standard output, so that an error shows now and not after the exit code is set."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -173,7 +173,7 @@ def _flush() -> None:
 
 
 def _name_of_output() -> str:
-    """Where an error of the disk that names no file came from: does the output take a line?"""
+    """Source of a disk error without a file name: standard output if writing to it fails, too."""
     try:
         sys.stdout.write("\n")
         _flush()
@@ -185,7 +185,7 @@ def _name_of_output() -> str:
 def _show_warning(
     name: str, message: Warning | str, category: type[Warning], *where: Any, **_: Any
 ) -> None:
-    """Print a warning in one line; others than ours say where they come from."""
+    """Print a warning in one line; warnings of other packages include their origin."""
     ours = issubclass(category, InputWarning)
     place = "" if ours else f" ({category.__name__} in {where[0]}, line {where[1]})"
     print(f"{name}: warning: {one_line(message)}{place}", file=sys.stderr)
@@ -200,9 +200,9 @@ def report_failures(errors: Sequence[str], name: str = "ms-slam") -> int:
 
 
 def _one_line(box: str) -> str:
-    """The message of tyro's box: its lines up to the first rule, or its title without any.
+    """The message in tyro's box: its lines up to the first rule, or its title if it has no rule.
 
-    The options that tyro finds similar follow the message.
+    Similar options suggested by tyro are appended.
     """
     title, *lines = box.splitlines() or [""]
     _, _, proposals = box.partition("Perhaps you meant")

@@ -1,8 +1,8 @@
-"""Extension points: what stands behind a name of ours, of an entry point, or ``module:Class``.
+"""Extension points: find an object by a built-in name, an entry point, or ``module:Class``.
 
 SLAM backends, observations, rewards, scenes, perturbations, metrics, experiments, planners and
-trainers are found here, alike in Python, on the command line and in worker processes. Where a name
-is taken, the class or function itself may be given in Python.
+trainers are found here, in the same way in Python, on the command line and in worker processes. In
+Python, the class or function itself may be passed instead of a name.
 """
 
 from __future__ import annotations
@@ -31,18 +31,17 @@ _EXTRAS = {
 
 @dataclass(frozen=True)
 class ExtensionPoint:
-    """One kind of thing that has names.
+    """One kind of named object that can be extended.
 
     Attributes:
-        kind: in error messages, such as ``SLAM backend``.
-        group: of entry points, such as ``ms_slam_env.slam``.
-        base: class of which what is found is a subclass, or instance of a function's result; None
-            for anything that can be called.
-        own: our names and what they stand for; a text ``module:name`` is imported when it is asked
-            for.
-        form: of the names that a user makes up.
-        takes: names of what it is called with, in order; None where that differs.
-        elsewhere: patterns of names that mean something in another place alone, and what to say.
+        kind: name of the kind in error messages, such as ``SLAM backend``.
+        group: group of entry points, such as ``ms_slam_env.slam``.
+        base: base class of the classes found, or class of the instances that a function returns;
+            None for any callable.
+        own: built-in names to objects; a text ``module:name`` is imported on first use.
+        form: form of names that users may give.
+        takes: names of the arguments that the object is called with, in order; None if they vary.
+        elsewhere: patterns of names that are valid only elsewhere, and the hint to show for each.
     """
 
     kind: str
@@ -54,16 +53,16 @@ class ExtensionPoint:
     elsewhere: Mapping[str, str] = field(default_factory=dict)
 
     def names(self) -> tuple[str, ...]:
-        """Our names, and those of the installed entry points."""
+        """The built-in names, and those of installed entry points."""
         installed = sorted({entry.name for entry in entry_points(group=self.group)})
         return tuple(dict.fromkeys([*self.own, *installed]))
 
     def find(self, name: Any) -> Any:
-        """What ``name`` stands for; a class or function stands for itself.
+        """Find the object named ``name``; a class or function is returned unchanged.
 
         Raises:
             InputError: an unknown name (the message lists the choices), a module or an entry point
-                that cannot be loaded, or something of another kind.
+                that cannot be loaded, or an object of another kind.
         """
         if not isinstance(name, str):
             if self.base is not None and isinstance(name, self.base):
@@ -80,9 +79,9 @@ class ExtensionPoint:
             if re.match(pattern, name):
                 raise InputError(f"{self.kind} {name!r}: {hint}")
         if ":" in name:
-            # A console script, unlike ``python -m``, leaves the current folder out. It stays, since
-            # worker processes, which get this path, import the module too; and it comes last, so
-            # that no ``random.py`` there stands in for a library's that is imported later.
+            # A console script, unlike ``python -m``, does not search the current folder. The entry
+            # stays, since worker processes inherit it to import the module, too. It comes last, so
+            # that a ``random.py`` there does not replace a library's module imported later.
             if os.getcwd() not in sys.path:
                 sys.path.append(os.getcwd())
             return self._checked(self._load(name, name, ""), name)
@@ -92,7 +91,7 @@ class ExtensionPoint:
         return self._checked(self._of_entry(found[0]), name)
 
     def unknown(self, name: object, more: Iterable[str] = ()) -> InputError:
-        """The error for a name that stands for nothing; ``more`` may be named besides."""
+        """The error for an unknown name; ``more`` lists further valid choices."""
         error = unknown(self.kind, name, (*self.names(), *more, self.form))
         hint = f"an entry point ({self.group}) is found once its package is installed again"
         return InputError(f"{error}; {hint}")
@@ -114,7 +113,7 @@ class ExtensionPoint:
         return found
 
     def _checked(self, found: Any, name: Any) -> Any:
-        """``found``, if it is of this kind."""
+        """Return ``found`` if it is of this kind, otherwise raise."""
         if self.base is None:
             if not callable(found):
                 raise InputError(f"{self.kind} {name!r} is not callable")
@@ -132,7 +131,7 @@ class ExtensionPoint:
 
 
 def load_reference(value: str) -> Any:
-    """What a text ``module:attribute`` stands for; its module is imported now."""
+    """Import the object named by ``module:attribute``."""
     module, _, path = value.partition(":")
     found: Any = import_module(module)
     for part in path.split("."):
@@ -149,14 +148,14 @@ def is_reference(name: str) -> bool:
 def check_call(
     kind: str, make: Callable[..., Any], takes: tuple[str, ...], options: Collection[str] = ()
 ) -> None:
-    """Refuse what cannot be called with arguments ``takes`` and the named ``options``.
+    """Refuse an object that cannot be called with arguments ``takes`` and the named ``options``.
 
     Raises:
-        InputError: naming the thing and what it is called with.
+        InputError: the message names the object and the call.
     """
     try:
         signature = inspect.signature(make)
-    except (TypeError, ValueError):  # a part of the interpreter, which does not say
+    except (TypeError, ValueError):  # built into the interpreter, without a signature
         return
     try:
         signature.bind(*takes, **dict.fromkeys(options))
@@ -173,12 +172,12 @@ def check_options(
     given: Collection[str],
     common: Collection[str] = (),
 ) -> None:
-    """Refuse options that are no parameters of ``make`` beside those ``given`` anyway.
+    """Refuse options that are not parameters of ``make``, except those ``given`` by the caller.
 
-    All things of the kind have the options ``common`` besides.
+    The options in ``common`` are valid for all objects of the kind.
 
     Raises:
-        InputError: naming the option and listing the valid ones.
+        InputError: unknown option; the message names it and lists the valid ones.
     """
     names = _parameter_names(make)
     if names is None:
@@ -190,9 +189,9 @@ def check_options(
 
 
 def _parameter_names(make: Callable[..., Any]) -> list[str] | None:
-    """What ``make`` takes by name; None for anything.
+    """Names of the parameters of ``make``; None if it accepts any.
 
-    What a class takes as ``**options`` is for the class before it in the order of inheritance.
+    The ``**options`` of a class are those of its base class.
     """
     layers: list[Any] = [make]
     if isinstance(make, type):

@@ -1,6 +1,6 @@
-"""Files that a user names or a stranger wrote: regular ones of bounded size, and nothing else.
+"""Read untrusted files: only regular files of bounded size.
 
-A pipe would block, a device never end, and a file of any size fill the memory.
+A pipe would block, a device would never end, and an unbounded file could fill the memory.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from typing import Any
 from ms_slam_env.errors import InputError
 
 MAX_TEXT_BYTES = 64 * 1024 * 1024
-"""Of a listing, a trajectory or a configuration: a day of frames at 30 Hz has a quarter of it."""
+"""Limit for a listing, a trajectory or a configuration; a day at 30 Hz takes a quarter."""
 
 MAX_IMAGE_BYTES = 128 * 1024 * 1024
-"""Of an image file: more than 4096 x 4096 pixels of colour at 16 bits need without compression."""
+"""Limit for an image; 4096 x 4096 colour pixels of 16 bits need less without compression."""
 
 MAX_MESH_BYTES = 2 * 1024 * 1024 * 1024
-"""Of a mesh or a cloud."""
+"""Limit for a mesh or a point cloud."""
 
 
 def check_file(path: str | Path, kind: str, most_bytes: int) -> None:
-    """Refuse what is no regular file or too large, for libraries that open files themselves.
+    """Refuse a path that is not a regular file or is too large, before a library opens it.
 
     Args:
-        path: of the file.
-        kind: of file, for the error message: "trajectory", "image".
-        most_bytes: largest size.
+        path: the file.
+        kind: kind of file in the error message, such as "trajectory" or "image".
+        most_bytes: largest allowed size.
 
     Raises:
-        InputError: naming the file.
+        InputError: refused; the message names the file.
     """
     try:
         found = os.stat(path)
@@ -43,16 +43,16 @@ def check_file(path: str | Path, kind: str, most_bytes: int) -> None:
 
 
 def read_bytes(path: str | Path, kind: str, most_bytes: int) -> bytes:
-    """What a file holds; see `check_file`."""
+    """Read a file; refuses the same as `check_file`."""
     check_file(path, kind, most_bytes)
     try:
-        # Not blocking: what took the file's place since may be a pipe that nobody writes to.
+        # Non-blocking, since a pipe without writer may have replaced the file meanwhile.
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         with os.fdopen(descriptor, "rb") as file:
             _check(os.fstat(descriptor), path, kind, most_bytes)
             size = os.fstat(descriptor).st_size
-            data = file.read(size + 1)  # as much is allocated as is asked for
-            if len(data) > size:  # it grew meanwhile, or the system does not tell its size
+            data = file.read(size + 1)  # allocates as much as requested
+            if len(data) > size:  # the file grew, or the system does not report its size
                 data += file.read(most_bytes + 1 - len(data))
     except OSError as error:
         raise _unreadable(path, kind, error) from None
@@ -62,10 +62,10 @@ def read_bytes(path: str | Path, kind: str, most_bytes: int) -> bytes:
 
 
 def read_text(path: str | Path, kind: str, most_bytes: int = MAX_TEXT_BYTES) -> str:
-    """The text of a file in UTF-8, without the mark that may begin it; see `check_file`.
+    """Read a UTF-8 text file, without a byte order mark; refuses the same as `check_file`.
 
     Raises:
-        InputError: also what is no UTF-8.
+        InputError: also for text that is not UTF-8.
     """
     try:
         return read_bytes(path, kind, most_bytes).decode("utf-8-sig")
@@ -74,17 +74,16 @@ def read_text(path: str | Path, kind: str, most_bytes: int = MAX_TEXT_BYTES) -> 
 
 
 def read_json(path: str | Path, kind: str, most_bytes: int = MAX_TEXT_BYTES) -> Any:
-    """What a JSON file holds; see `check_file`.
+    """Read a JSON file; refuses the same as `check_file`.
 
     Raises:
-        InputError: also what is no JSON, is nested too deeply, or has a number of thousands of
-            digits.
+        InputError: also for invalid JSON, too deep nesting, or a number with thousands of digits.
     """
     return parse_json(read_text(path, kind, most_bytes), path)
 
 
 def parse_json(text: str | bytes, path: str | Path) -> Any:
-    """What the JSON text of file ``path`` says.
+    """Parse JSON ``text`` that was read from file ``path``.
 
     Raises:
         InputError: as `read_json`.
@@ -101,9 +100,9 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
 
 
 def words_of(line: str) -> list[str]:
-    """Words of a line between blanks, commas or semicolons.
+    """Words of a line, separated by blanks, commas or semicolons.
 
-    Between numbers that blanks or semicolons separate already, a comma is a decimal mark.
+    If blanks or semicolons already separate the numbers, a comma is a decimal mark.
     """
     words = (line.replace(";", " ") if ";" in line else line).split()
     if "," not in line:
@@ -114,9 +113,9 @@ def words_of(line: str) -> list[str]:
 
 
 def is_named(path: Path) -> bool:
-    """Whether something has this name, a link that leads nowhere included.
+    """Whether the path exists, even as a broken link.
 
-    What has a name is meant to be read, so that a link that broke is an error and not an absence.
+    A broken link is then an error when it is read, instead of a missing file.
     """
     return os.path.lexists(path)
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM end a command, also where a library swallows the exception."""
+"""Let Ctrl-C and SIGTERM end a command, even if a library swallows the exception."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ _AGAIN_S = 0.2
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, which ends a command as Ctrl-C does: what is kept then, is kept now."""
+    """Raised on SIGTERM, which ends a command like Ctrl-C and keeps the same partial work."""
 
 
 def recorded(error: BaseException) -> str:
-    """What is recorded of an error that ended some work: its text, of an interrupt the signal."""
+    """Text to record for an error that ended some work: its message, or the signal's name."""
     if isinstance(error, KeyboardInterrupt):
         return f"interrupted by {'SIGTERM' if isinstance(error, Terminated) else 'SIGINT'}"
     return str(error) or type(error).__name__
 
 
 class Interrupts:
-    """While this context lasts, SIGINT and SIGTERM raise KeyboardInterrupt until it is handled.
+    """Context in which SIGINT and SIGTERM raise KeyboardInterrupt until it is handled.
 
-    That of SIGTERM is `Terminated`.
+    SIGTERM raises its subclass `Terminated`.
 
-    Libraries have ``except BaseException`` around their imports (trimesh has dozens), in callbacks
-    and the like, which lose an interrupt. So a timer looks every 0.2 s whether the exception is
-    still under way, being handled somewhere up the stack, and raises it again where it is not. A
-    second signal interrupts what the first one set off.
+    Some libraries lose an interrupt, because they use ``except BaseException`` in callbacks or
+    around imports (trimesh has dozens). So a timer checks every 0.2 s whether the exception is
+    still being handled somewhere up the stack, and raises it again if not. A second signal
+    interrupts the handling of the first.
 
-    Outside the main thread, and for a signal that the process was started to ignore, this changes
-    nothing.
+    Outside the main thread, and for signals that the process was started to ignore, the context
+    has no effect.
 
     Attributes:
-        signal: that came; None if none did.
+        signal: signal received; None if none.
     """
 
     def __init__(self) -> None:
@@ -81,9 +81,9 @@ class Interrupts:
 
 @contextmanager
 def sigterm_exits() -> Iterator[None]:
-    """Let SIGTERM end the process as ``sys.exit`` does: what is to be done at the end is done.
+    """Let SIGTERM end the process like ``sys.exit``, so that cleanup runs.
 
-    Workers are ended by it. Outside the main thread this changes nothing.
+    Used in workers. Has no effect outside the main thread.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -97,7 +97,7 @@ def sigterm_exits() -> Iterator[None]:
 
 @contextmanager
 def kept(what: str) -> Iterator[None]:
-    """Let an interrupt in here say ``what`` is kept of the work."""
+    """Add to an interrupt in this context the text ``what``, which says what work is kept."""
     try:
         yield
     except KeyboardInterrupt as interrupt:

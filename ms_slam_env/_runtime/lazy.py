@@ -1,6 +1,6 @@
-"""Packages whose names are imported when they are asked for.
+"""Lazy imports: packages whose names are imported on first use.
 
-A command that only reads its options then waits for no ray caster.
+A command that only reads its options then does not wait for the ray caster.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Any
 
 
 def lazy_names(package: str) -> Callable[[str], Any]:
-    """``__getattr__`` of a package: imports what its block ``if TYPE_CHECKING:`` imports, by name.
+    """A ``__getattr__`` for a package that imports the names of its ``if TYPE_CHECKING:`` block.
 
-    That block is the one list of what the package offers, for type checkers and for Python.
+    That block is then the single list of public names, for type checkers and for Python.
     """
 
     @cache

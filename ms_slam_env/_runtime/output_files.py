@@ -1,8 +1,8 @@
-"""Files that are whole or not there, and results that count once their last file is in place.
+"""Write files atomically; results count once their last file is in place.
 
-Whatever the package writes goes through here, so that a full disk costs what was being written and
-nothing else, and is one error that names the file. A folder of results may come from a stranger:
-no link in it leads what is written to another place.
+All files that the package writes go through here. A full disk then loses only the file being
+written, and gives one error that names it. A folder of results may be untrusted, so no link in it
+can redirect what is written.
 """
 
 from __future__ import annotations
@@ -40,25 +40,26 @@ DISK_ERRORS = {
     for name in ("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EROFS")
     if hasattr(errno, name)
 }
-"""Numbers of the errors of a disk that is full, over quota, broken or read-only."""
+"""Error numbers of a disk that is full, over quota, broken or read-only."""
 
 
 # -- Files -------------------------------------------------------------------------------------
 
 
 def write_bytes(path: Path, data: bytes, durable: bool = True) -> None:
-    """Write a file; whatever goes wrong leaves the old one or the new one, never half of one.
+    """Write a file atomically: a failure leaves the old or the new file, never a part.
 
-    Its folder is made if it is not there.
+    Creates its folder if missing.
 
     Args:
-        path: of the file.
-        data: all of it.
-        durable: whether it is on disk when this returns, also if the power fails; slow for many.
+        path: the file.
+        data: its whole content.
+        durable: whether it must be on disk, safe against power loss, when this returns; slow for
+            many files.
 
     Raises:
-        InputError: ``path`` is a device or the like, which a file would replace.
-        OSError: with the name of the file: no space, no right, a broken disk.
+        InputError: ``path`` is a special file such as a device, which a file would replace.
+        OSError: no space, no permission or a broken disk; the message names the file.
     """
     with new_file(path, durable) as descriptor:
         _write(descriptor, data)
@@ -66,15 +67,15 @@ def write_bytes(path: Path, data: bytes, durable: bool = True) -> None:
 
 @contextmanager
 def new_file(path: Path, durable: bool = True) -> Iterator[int]:
-    """A descriptor to write to; the file takes its place ``path`` at the end, or never.
+    """A descriptor to write to; the file is moved to ``path`` at the end, or not at all.
 
-    It grows under a name that was not there before, so that two writers do not meet and no link is
-    followed: one at ``path`` is replaced. See `write_bytes`.
+    It is written under a new name, so that two writers do not collide and no link is followed; a
+    link at ``path`` is replaced. See `write_bytes`.
     """
     check_kind(path, "file")
     with naming(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        if durable:  # images by the thousand do not look through their folder for each
+        if durable:  # thousands of images should not each scan their folder
             remove_left_behind(path.parent)
         partial = working_name(path.parent)
         descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OWN, 0o666)
@@ -92,17 +93,17 @@ def new_file(path: Path, durable: bool = True) -> Iterator[int]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """`write_bytes` of ``text`` in UTF-8."""
+    """Write ``text`` in UTF-8 with `write_bytes`."""
     write_bytes(path, text.encode("utf-8", errors="replace"))
 
 
 @contextmanager
 def growing_file(path: Path) -> Iterator[Callable[[str], None]]:
-    """A new text file; what is given adds a line to it, which is there at once.
+    """Create a text file and return a function that appends a line, which is written at once.
 
     Raises:
-        InputError: ``path`` is a device or the like.
-        OSError: with the name of the file.
+        InputError: ``path`` is a special file such as a device.
+        OSError: the file cannot be written; the message names it.
     """
     write_bytes(path, b"", durable=False)
     descriptor = open_own(path)
@@ -118,20 +119,20 @@ def growing_file(path: Path) -> Iterator[Callable[[str], None]]:
 
 
 def append_line(path: Path, line: bytes) -> None:
-    """Add a line, end included, to a file; it is on disk when this returns.
+    """Append a line, including its line end, to a file; it is on disk when this returns.
 
-    A line that does not fit leaves the file as it was. A last line without an end, which a kill cut
-    short, is removed first. Several processes may append to one file.
+    If the line does not fit on the disk, the file is unchanged. A last line without line end, cut
+    short by a kill, is removed first. Several processes may append to one file.
 
     Raises:
-        InputError: ``path`` is a device or the like, or has other names.
-        OSError: with the name of the file.
+        InputError: ``path`` is a special file such as a device, or has other names.
+        OSError: the file cannot be written; the message names it.
     """
     descriptor = open_own(path, os.O_APPEND)
     with naming(path):
         try:
             if fcntl is not None:
-                with suppress(OSError):  # a disk without locks
+                with suppress(OSError):  # a file system without locks
                     fcntl.flock(descriptor, fcntl.LOCK_EX)
             length = _whole_lines(descriptor)
             os.ftruncate(descriptor, length)
@@ -146,7 +147,7 @@ def append_line(path: Path, line: bytes) -> None:
 
 
 def _whole_lines(descriptor: int) -> int:
-    """Bytes up to the end of the last line that has one."""
+    """Number of bytes up to the end of the last complete line."""
     length = os.lseek(descriptor, 0, os.SEEK_END)
     while length:
         start = max(0, length - 65536)
@@ -159,18 +160,18 @@ def _whole_lines(descriptor: int) -> int:
 
 
 def _write(descriptor: int, data: bytes) -> None:
-    """Write all of it; one call may take less, as on a disk that is nearly full."""
+    """Write all data; a single call may write less, for example on a nearly full disk."""
     rest = memoryview(data)
     while rest:
         rest = rest[os.write(descriptor, rest) :]
 
 
 def open_own(path: Path, flags: int = 0) -> int:
-    """A descriptor of a file to read and change, new or there already; see `check_own`.
+    """Open a new or existing file to read and change; see `check_own`.
 
     Raises:
-        InputError: see there.
-        OSError: with the name of the file.
+        InputError: as `check_own`.
+        OSError: the file cannot be opened; the message names it.
     """
     check_own(path)
     with naming(path):
@@ -179,11 +180,11 @@ def open_own(path: Path, flags: int = 0) -> int:
 
 
 def check_own(path: Path) -> None:
-    """Refuse a file to be changed in its place that is reached by other names, too.
+    """Refuse to change a file in place if it has other names.
 
     Raises:
-        InputError: a link, of either sort, which would lead what is written to another place; a
-            device or the like.
+        InputError: a symbolic or hard link, which would redirect what is written, or a special
+            file such as a device.
     """
     check_kind(path, "file", is_own=True)
     with suppress(FileNotFoundError):
@@ -193,7 +194,7 @@ def check_own(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Let errors of the system in here name ``path``, whatever file they happened at."""
+    """Let system errors in this context name ``path``, whichever file caused them."""
     try:
         yield
     except OSError as error:
@@ -201,13 +202,13 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def working_name(folder: Path) -> Path:
-    """A new name in ``folder`` that says which process works there."""
+    """A new name in ``folder`` that contains the name of this process."""
     process = process_name().replace("/", "-")
     return folder / f"{_WORKING}{process}-{secrets.token_hex(8)}"
 
 
 def remove_left_behind(folder: Path) -> None:
-    """Remove what processes of this machine that were killed were writing in ``folder``."""
+    """Remove unfinished files in ``folder`` of killed processes of this machine."""
     host = socket.gethostname()
     form = re.compile(rf"{re.escape(_WORKING + host)}-(\d+)-(\w*)-\w+")
     found = []
@@ -223,20 +224,20 @@ def remove_left_behind(folder: Path) -> None:
                 os.unlink(entry.path)
 
 
-# -- Which process works on something, and whether it still lives -------------------------------
+# -- Names of processes, and whether they are alive ---------------------------------------------
 
 
 def process_name(pid: int | None = None) -> str:
-    """Name of process ``pid`` (this one if None): host, number, and when it began."""
+    """Name of process ``pid`` (this one if None): host, process number, and start time."""
     pid = os.getpid() if pid is None else pid
     return f"{socket.gethostname()}/{pid}/{_start_of(pid)}"
 
 
 def is_alive(name: str) -> bool:
-    """Whether the process called ``name`` lives on this host.
+    """Whether the process called ``name`` is alive on this host.
 
-    Studies lie on one machine: the process of another host is one from before a container was
-    started anew, under a new name.
+    A study stays on one machine, so another host name comes from before a restart of the container,
+    and such a process counts as dead.
     """
     host, pid, start = name.rsplit("/", 2)
     if host != socket.gethostname():
@@ -248,14 +249,14 @@ def is_alive(name: str) -> bool:
     except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
-        pass  # it lives, and is another user's
+        pass  # alive, but of another user
     return _start_of(int(pid)) == start
 
 
 def _start_of(pid: int) -> str:
-    """Start of a process in clock ticks since boot, from proc(5); empty where there is no proc.
+    """Start of a process in clock ticks since boot, from proc(5); empty without proc.
 
-    Numbers of processes are used again. A process that ended and was not waited for counts as none.
+    It is needed because process numbers are reused. A zombie process counts as ended.
     """
     try:
         after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -268,10 +269,10 @@ def _start_of(pid: int) -> str:
 
 
 def check_out_folder(path: Path) -> None:
-    """Refuse, before any work, what cannot be or become a folder with results.
+    """Refuse, before any work, a path that cannot be or become a folder with results.
 
     Raises:
-        InputError: it or what it lies in is a file, a device or the like, or takes no files.
+        InputError: the path or its nearest existing parent is not a folder, or is not writable.
     """
     there = next((p for p in (path, *path.parents) if os.path.lexists(p)), Path())
     check_kind(there, "folder")
@@ -280,17 +281,17 @@ def check_out_folder(path: Path) -> None:
 
 
 def check_out_file(path: Path) -> None:
-    """The same of a file.
+    """Refuse, before any work, a path that cannot become an output file.
 
     Raises:
-        InputError: it is a folder, a device or the like, or its folder takes no files.
+        InputError: the path is a folder or a special file, or its folder is not writable.
     """
     check_kind(path, "file")
     check_out_folder(path.parent)
 
 
 def check_kind(path: Path, wanted: str, is_own: bool = False) -> None:
-    """Refuse what is there already and is something else; if it must be one's own, a link, too."""
+    """Refuse an existing path of another kind than ``wanted``; with ``is_own``, also a link."""
     if not os.path.lexists(path):
         return
     try:

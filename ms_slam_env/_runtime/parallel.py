@@ -1,20 +1,20 @@
-"""Work for several processes, here or on a Ray cluster, and how many threads a process takes.
+"""Run work in several processes, here or on a Ray cluster; limit the threads of a process.
 
-A pool runs one spec after another in each of its workers, which keep what they have cached; the
-death of a worker costs only the spec in its hands::
+A pool runs one spec after another in each of its workers, which keep their caches. If a worker
+dies, only its current spec is lost::
 
     with open_pool(run, workers=4, ray_address=args.ray) as pool:
         for outcome in run_each(pool, {key: spec for ...}):    # as they finish
             outcome.key, outcome.value, outcome.error, outcome.elapsed_s
 
-Who decides what comes next by what has come back gives and takes by hand::
+If the next spec depends on earlier outcomes, give and take by hand::
 
     while pool.idle and (spec := next_spec()):
         pool.give(key, spec)
     for outcome in pool.take(timeout_s=1.0): ...
 
 ``run`` must be importable by (or picklable for) a new process, and so must specs and values.
-Ctrl-C ends the caller, which ends the workers; they end too when the caller is killed.
+Ctrl-C ends the caller, which ends the workers; they also end when the caller is killed.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from ms_slam_env.errors import InputError
 
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMEXPR")
 THREAD_VARIABLES = tuple(f"{library}_NUM_THREADS" for library in _LIBRARIES)
-"""By which libraries learn, when they are loaded, how many threads they may start."""
+"""Environment variables from which libraries read, when loaded, how many threads to start."""
 
 LOCAL_CLUSTER = "local"
-"""Address of a Ray cluster on this machine that lives as long as the pool."""
+"""Address that starts a Ray cluster on this machine for the lifetime of the pool."""
 
 Run = Callable[[Any], Any]
 _HAS_AFFINITY = hasattr(os, "sched_setaffinity")
@@ -54,25 +54,25 @@ _HAS_AFFINITY = hasattr(os, "sched_setaffinity")
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if _HAS_AFFINITY else os.cpu_count() or 1
 
 
 def thread_environment(threads: int) -> dict[str, str]:
-    """Environment variables that give libraries loaded from now on so many threads."""
+    """Environment variables that limit libraries loaded later to ``threads`` threads."""
     return dict.fromkeys(THREAD_VARIABLES, str(threads))
 
 
 def one_thread_unless_set() -> dict[str, str]:
-    """Those of `thread_environment` for one thread that the user has not set otherwise."""
+    """The variables of `thread_environment` for one thread, except those set by the user."""
     return {name: one for name, one in thread_environment(1).items() if name not in os.environ}
 
 
 def limit_threads(threads: int) -> None:
-    """Keep this process on so many cores, whatever its libraries think.
+    """Limit this process to ``threads`` cores, whatever its libraries choose.
 
-    Libraries that are loaded later read the environment variables, OpenCV is told, and pools that
-    heed neither (TBB) obey the affinity.
+    Libraries loaded later read the environment variables, OpenCV is told directly, and pools that
+    ignore both (TBB) obey the CPU affinity.
     """
     import cv2
 
@@ -84,9 +84,9 @@ def limit_threads(threads: int) -> None:
 
 @contextmanager
 def limited_threads(threads: int | None) -> Iterator[None]:
-    """Keep the enclosed work on so many cores; None leaves everything as it is.
+    """Limit the enclosed work to ``threads`` cores; None changes nothing.
 
-    OpenCV is told; the threads that other libraries have started already obey the affinity.
+    OpenCV is told directly; threads that other libraries already started obey the CPU affinity.
     """
     if threads is None or not _HAS_AFFINITY:
         yield
@@ -104,7 +104,7 @@ def limited_threads(threads: int | None) -> Iterator[None]:
 
 
 def _set_affinity(cores: Collection[int]) -> None:
-    """Let every thread of this process run on ``cores`` alone."""
+    """Restrict every thread of this process to ``cores``."""
     for task in Path("/proc/self/task").glob("*"):
         with contextlib.suppress(ProcessLookupError):  # it has ended
             os.sched_setaffinity(int(task.name), cores)
@@ -115,18 +115,18 @@ def _set_affinity(cores: Collection[int]) -> None:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a spec.
+    """Outcome of running a spec.
 
     Attributes:
-        key: that it was given with.
-        value: what ``run`` returned; None if it raised or its worker died.
-        error: the first line of what went wrong, with the kind of the exception; None if nothing.
-        message: what the exception itself said.
-        where: the exception was raised, as ``file:line``.
-        traceback: of the exception.
+        key: key that the spec was given with.
+        value: return value of ``run``; None if it raised or its worker died.
+        error: first line of the error, with the type of the exception; None if there was none.
+        message: message of the exception.
+        where: where the exception was raised, as ``file:line``.
+        traceback: traceback of the exception.
         is_bad_input: whether it was an ``InputError``.
-        died: whether the worker died on it.
-        elapsed_s: by the clock.
+        died: whether the worker died.
+        elapsed_s: time by the clock, seconds.
     """
 
     key: Any
@@ -141,7 +141,7 @@ class Outcome:
 
 
 def attempt(run: Run, key: Any, spec: Any) -> Outcome:
-    """Run ``spec`` here; what it raises is in the outcome."""
+    """Run ``spec`` in this process; the outcome holds any exception."""
     start = time.perf_counter()
     try:
         outcome = Outcome(key, run(spec))
@@ -162,12 +162,14 @@ class _Worker(Protocol):
     """A process, here or in a cluster, that runs one spec after another."""
 
     def send(self, spec: Any) -> Any:
-        """Begin with a spec; what tells when it is done (a pipe, a future)."""
+        """Start a spec; return an object (pipe or future) that becomes ready when it is done."""
 
     def receive(self) -> Outcome:
-        """What came of the spec, without key; `_DiedError` if the worker died on it.
+        """Outcome of the spec, without key.
 
-        `_DiedAtRestError` if it died before it began with it.
+        Raises:
+            _DiedError: the worker died while running it.
+            _DiedAtRestError: the worker died before starting it.
         """
 
     def stop(self) -> None:
@@ -179,13 +181,13 @@ class _DiedError(Exception):
 
 
 class _DiedAtRestError(Exception):
-    """A worker died between two specs: the second is untouched."""
+    """A worker died between two specs, so the second was not started."""
 
 
 class Pool:
-    """Workers that each run one spec after another, started when there is work for them.
+    """Workers that each run one spec after another, started when there is work.
 
-    Use it as a context: at its end the workers are ended, whatever they are doing.
+    Use it as a context manager: on exit the workers are stopped, whatever they are doing.
     """
 
     def __init__(
@@ -209,12 +211,12 @@ class Pool:
 
     @property
     def idle(self) -> int:
-        """Workers that wait for a spec."""
+        """Number of workers that wait for a spec."""
         return self._workers - len(self._working)
 
     @property
     def busy(self) -> int:
-        """Workers that have a spec in their hands."""
+        """Number of workers that are running a spec."""
         return len(self._working)
 
     def give(self, key: Any, spec: Any) -> None:
@@ -223,10 +225,10 @@ class Pool:
         self._working[worker.send(spec)] = (worker, key, spec, time.perf_counter())
 
     def take(self, timeout_s: float | None = None) -> list[Outcome]:
-        """Wait for outcomes, at most so long; those that are there, none if no worker is busy.
+        """Wait up to ``timeout_s`` and return the outcomes so far; none if no worker is busy.
 
-        A worker that died is replaced. What it had not begun with is given to another, but on a
-        cluster, which does not tell whether it had.
+        A dead worker is replaced, and a spec that it had not started goes to another worker; on a
+        cluster it does not, since one cannot tell whether it had started.
         """
         outcomes: list[Outcome] = []
         while self._working and not outcomes:
@@ -238,7 +240,7 @@ class Pool:
         return outcomes
 
     def _outcome(self, worker: _Worker, key: Any, spec: Any, start: float) -> Outcome | None:
-        """None if the spec is with another worker now."""
+        """Outcome of the spec; None if it was passed to another worker."""
         try:
             outcome = replace(worker.receive(), key=key)
         except _DiedAtRestError:
@@ -256,7 +258,7 @@ class Pool:
         return outcome
 
     def stop(self) -> None:
-        """End the workers; what runs at this moment is lost."""
+        """Stop the workers; running specs are lost."""
         for worker in (*self._resting, *(each[0] for each in self._working.values())):
             worker.stop()
         self._resting, self._working = [], {}
@@ -264,7 +266,7 @@ class Pool:
 
 
 def run_each(pool: Pool, specs: Mapping[Any, Any]) -> Iterator[Outcome]:
-    """Outcomes of all ``specs``, in the order in which they finish; specs are begun in theirs."""
+    """Outcomes of all ``specs`` in the order they finish; specs start in the given order."""
     waiting = iter(specs.items())
     left = len(specs)
     while left or pool.busy:
@@ -285,12 +287,12 @@ def open_pool(
     """Workers that call ``run``.
 
     Args:
-        run: called with one spec after another.
-        workers: how many; None for one a core of this machine.
-        ray_address: of a Ray cluster, `LOCAL_CLUSTER` for one of its own; None for processes of
-            this machine.
-        environment: variables of the workers beside those of this process.
-        fresh: whether each spec has a new process, as measuring peak memory needs it.
+        run: function called with one spec after another.
+        workers: number of workers; None for one per core of this machine.
+        ray_address: address of a Ray cluster, or `LOCAL_CLUSTER` to start one; None for processes
+            of this machine.
+        environment: environment variables of the workers, in addition to this process's.
+        fresh: whether each spec runs in a new process, as needed to measure peak memory.
 
     Raises:
         InputError: fewer than one worker, Ray is not installed, or no cluster at the address.
@@ -322,11 +324,11 @@ class _Process:
     def __init__(self, run: Run, environment: Mapping[str, str]) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._begun, begins = context.Pipe(duplex=False)  # a word of each spec that it takes
+        self._begun, begins = context.Pipe(duplex=False)  # a message for each spec it starts
         self._has_rested = False
         arguments = (theirs, begins, run)
         self._process = context.Process(target=_serve, args=arguments, daemon=True)
-        with _environment(environment):  # inherited, and read when libraries are loaded
+        with _environment(environment):  # inherited, and read by libraries on loading
             self._process.start()
         theirs.close()  # so that reading ends when the process does
         begins.close()
@@ -349,7 +351,7 @@ class _Process:
         return outcome
 
     def _has_begun(self) -> bool:
-        """Whether the process, which is dead, had begun with what it was sent last."""
+        """Whether the dead process had started the last spec it was sent."""
         try:
             self._begun.recv_bytes()
         except (EOFError, ConnectionError):
@@ -365,7 +367,7 @@ class _Process:
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Have these environment variables meanwhile."""
+    """Set these environment variables within the context."""
     before = {name: os.environ[name] for name in variables if name in os.environ}
     os.environ.update(variables)
     try:
@@ -377,8 +379,8 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 
 def _serve(pipe: Connection, begun: Connection, run: Run) -> None:
-    """Run what comes through ``pipe``; leave Ctrl-C to the parent, and end when it does."""
-    tqdm.set_lock(threading.RLock())  # its own is a semaphore, left behind by who is terminated
+    """Run specs that arrive through ``pipe``; leave Ctrl-C to the parent, and end with it."""
+    tqdm.set_lock(threading.RLock())  # its default is a semaphore, which a killed process leaks
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -13,12 +13,12 @@ EVERY_S = 30.0
 
 
 class Bar(tqdm):
-    """A tqdm that writes a line every 30 s, and at its end, where there is no terminal.
+    """A tqdm bar that, without a terminal, writes a line every 30 s and at its end.
 
-    A bar that is drawn over itself would fill a log with carriage returns.
+    Redrawing the bar would fill a log with carriage returns.
     """
 
-    monitor_interval = 10  # seconds, of tqdm's thread, which sees to an iteration that takes long
+    monitor_interval = 10  # seconds, for tqdm's thread that redraws during long iterations
 
     def __init__(self, *args: Any, **options: Any) -> None:
         self._in_terminal = sys.stderr.isatty()
@@ -31,7 +31,7 @@ class Bar(tqdm):
         super().__init__(*args, **options)
 
     def display(self, msg: str | None = None, pos: int | None = None) -> Any:
-        """Draw the bar; in a log write a line, unless the last was a moment ago."""
+        """Draw the bar; in a log, write a line if the last one is old enough."""
         if self._in_terminal:
             return super().display(msg, pos)
         if time.monotonic() - self._written_at >= EVERY_S:
@@ -39,12 +39,12 @@ class Bar(tqdm):
         return True
 
     def clear(self, nolock: bool = False) -> None:
-        """Make room for another line; in a log there is nothing to be cleared."""
+        """Make room for another line; in a log there is nothing to clear."""
         if self._in_terminal:
             super().clear(nolock)
 
     def close(self) -> None:
-        """End the bar, in a log with a last line."""
+        """Close the bar; in a log, write a last line."""
         if not self.disable and not self._in_terminal:
             self._write_line()
             self.disable = True

@@ -1,4 +1,4 @@
-"""Folders of results: whole or as they were before, written by one process at a time."""
+"""Folders of results, written atomically and by one process at a time."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ except ImportError:  # Windows: one process at a time
     fcntl = None  # type: ignore[assignment]
 
 _LOCK = ".ms-slam.lock"
-_MOVING_S = 60.0  # that another process may take to move a result into its place
+_MOVING_S = 60.0  # longest time for another process to move a result into place
 _held: set[str] = set()  # locks of this process
 
 
 @contextmanager
 def result_folder(out: Path, marker: str) -> Iterator[Path]:
-    """A folder to write a result into, whose files then move into ``out``, ``marker`` the last.
+    """A temporary folder to write a result into; its files then move to ``out``, ``marker`` last.
 
-    Who finds the marker finds the whole result. What fails or is interrupted before leaves ``out``
-    as it was. The working folder lies in ``out``: on the same disk, under the same rights.
+    If the marker exists, the result is complete. A failure or interrupt before that leaves ``out``
+    unchanged. The temporary folder is inside ``out``: on the same disk, with the same permissions.
 
     Args:
-        out: of the result; made if it is not there.
-        marker: name of the file that makes the others count.
+        out: folder of the result; created if missing.
+        marker: name of the file whose presence means that the result is complete.
 
     Raises:
-        InputError: a link in ``out`` leads to another place.
-        OSError: with the name of the file.
+        InputError: a link in ``out`` leads elsewhere.
+        OSError: a file cannot be written; the message names it.
     """
     with _made(out):
         remove_left_behind(out)
@@ -62,7 +62,7 @@ def result_folder(out: Path, marker: str) -> Iterator[Path]:
 
 
 def _move(working: Path, out: Path, marker: str) -> None:
-    """Move every file to its place, ``marker`` the last."""
+    """Move every file to its place, ``marker`` last."""
     files = [path.relative_to(working) for path in working.rglob("*") if path.is_file()]
     for file in files:
         for folder in reversed(file.parents[:-1]):
@@ -77,7 +77,7 @@ def _move(working: Path, out: Path, marker: str) -> None:
 
 @contextmanager
 def _naming_target(working: Path, out: Path) -> Iterator[None]:
-    """Let errors of the system name a file where it was to be."""
+    """Let system errors name a file by its final path."""
     try:
         yield
     except OSError as error:
@@ -87,11 +87,11 @@ def _naming_target(working: Path, out: Path) -> Iterator[None]:
 
 
 def own_folder(path: Path) -> Path:
-    """Make a folder within one of results, where there is none, and return it.
+    """Create a folder inside a folder of results, if missing, and return it.
 
     Raises:
-        InputError: it is a link, which may lead elsewhere, or no folder.
-        OSError: with its name.
+        InputError: it is a link, which may lead elsewhere, or not a folder.
+        OSError: it cannot be created; the message names it.
     """
     check_kind(path, "folder", is_own=True)
     with naming(path):
@@ -102,7 +102,7 @@ def own_folder(path: Path) -> Path:
 
 @contextmanager
 def _made(folder: Path) -> Iterator[None]:
-    """Let there be a folder; what was made for it and stays empty goes again."""
+    """Create a folder for the context; folders created for it that stay empty are removed."""
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         with naming(folder):
@@ -110,7 +110,7 @@ def _made(folder: Path) -> Iterator[None]:
         yield
     finally:
         for each in missing:
-            with suppress(OSError):  # there is something in it
+            with suppress(OSError):  # it is not empty
                 each.rmdir()
 
 
@@ -119,19 +119,19 @@ def _made(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def alone_in(folder: Path, lock: Path | None = None, wait_s: float = 0.0) -> Iterator[None]:
-    """Let no other process work in ``folder`` meanwhile.
+    """Keep other processes from working in ``folder`` during the context.
 
-    The system drops the lock when the process dies, however it dies. What this process holds it may
-    take again. On a disk that knows no locks nothing is held.
+    The system releases the lock when the process dies, in whatever way. This process may take its
+    lock again. On a file system without locks, nothing is locked.
 
     Args:
-        folder: of the work.
-        lock: file that is locked; by default one in ``folder``. Its folder is made if need be.
-        wait_s: how long to wait for another process.
+        folder: folder of the work.
+        lock: file to lock; by default one in ``folder``. Its folder is created if missing.
+        wait_s: how long to wait for another process, seconds.
 
     Raises:
-        InputError: another process works there; it is named.
-        OSError: with the name of the lock.
+        InputError: another process works there; the message names it.
+        OSError: the lock cannot be used; the message names it.
     """
     path = lock or folder / _LOCK
     key = os.path.realpath(path)
@@ -151,19 +151,19 @@ def alone_in(folder: Path, lock: Path | None = None, wait_s: float = 0.0) -> Ite
 
 
 def lock_beside(path: Path) -> Path:
-    """The lock of a folder that is moved to ``path`` when it is whole."""
+    """The lock of a folder that is moved to ``path`` once it is complete."""
     name = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:16]
     return path.parent / f".ms-slam-{name}.lock"
 
 
 def _lock(path: Path, folder: Path, wait_s: float) -> int:
-    """A descriptor of the locked file, with the name of this process in it."""
+    """Lock the file, write this process's name into it, and return its descriptor."""
     until = time.monotonic() + wait_s
     while True:
         descriptor = open_own(path)
         try:
             if _is_locked(descriptor):
-                if _is_at(path, descriptor):  # and not one that its holder has just removed
+                if _is_at(path, descriptor):  # not a lock that its holder has just removed
                     with suppress(OSError):  # a full disk
                         os.ftruncate(descriptor, 0)
                         os.write(descriptor, process_name().encode())
@@ -188,7 +188,7 @@ def _is_locked(descriptor: int) -> bool:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    except OSError:  # a disk without locks
+    except OSError:  # a file system without locks
         pass
     return True
 
@@ -201,7 +201,7 @@ def _is_at(path: Path, descriptor: int) -> bool:
 
 
 def _holder(descriptor: int) -> str:
-    """Who says in a lock file that it holds it."""
+    """Name of the process that holds a lock file, as written in it."""
     said = re.fullmatch(
         r"([\w.-]{1,64})/(\d{1,10})/\w*", os.read(descriptor, 200).decode(errors="replace")
     )

@@ -1,4 +1,4 @@
-"""Where an environment's time goes; kept out of ``info`` so that infos stay reproducible."""
+"""Time spent in the stages of an environment, outside ``info`` so that infos are reproducible."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from contextlib import contextmanager
 class Timings:
     """Seconds spent in each stage: in its last call, and in total with the number of calls.
 
-    Stages nest: ``observation`` contains the ``lookahead`` that the variant of that name asks for.
-    ``total`` counts what is nested in a stage, ``own`` does not, so that the ``own`` of all stages
-    add up to the time spent in any.
+    Stages nest: ``observation`` contains the ``lookahead`` of the observation variant of that name.
+    ``total`` includes nested stages; ``own`` does not, so that the ``own`` times of all stages add
+    up to the time spent in any stage.
     """
 
     def __init__(self) -> None:
@@ -21,11 +21,11 @@ class Timings:
         self.own: dict[str, float] = defaultdict(float)
         self.calls: dict[str, int] = defaultdict(int)
         self.last: dict[str, float] = {}
-        self._nested: list[float] = []  # seconds of the stages within each open one
+        self._nested: list[float] = []  # seconds in nested stages, for each open stage
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Charge the enclosed block to stage ``name``."""
+        """Count the time of the enclosed block for stage ``name``."""
         start = time.perf_counter()
         self._nested.append(0.0)
         try:
@@ -40,7 +40,7 @@ class Timings:
                 self._nested[-1] += elapsed
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Reset all times."""
         self.total.clear()
         self.own.clear()
         self.calls.clear()

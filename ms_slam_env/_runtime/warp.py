@@ -1,4 +1,4 @@
-"""NVIDIA Warp, initialised once: quiet, forward kernels only; launches and arrays used again."""
+"""NVIDIA Warp, initialised once (quiet, forward kernels only); reusable launches and arrays."""
 
 import atexit
 import ctypes
@@ -20,7 +20,7 @@ from ms_slam_env.errors import InputError, InputWarning
 
 if TYPE_CHECKING:
     kernel_wp: Any
-    """Warp where kernels are written: its 32-bit numbers are no types of Python's."""
+    """Warp as used in kernels, typed as Any, since its 32-bit numbers are not Python types."""
 else:
     kernel_wp = wp
 
@@ -29,7 +29,7 @@ wp.config.enable_backward = False
 
 
 def _init_quietly() -> OSError | None:
-    """Initialise; without a GPU the native library warns on file descriptor 2, at every start."""
+    """Initialise without the warning that the native library prints if there is no GPU."""
     saved = os.dup(2)
     try:
         with open(os.devnull, "w") as nowhere:
@@ -41,10 +41,10 @@ def _init_quietly() -> OSError | None:
 
 
 def _check_home() -> None:
-    """Refuse a user without a home folder: Warp would make one that is called ``~``.
+    """Refuse a user without a home folder, since Warp would create one called ``~``.
 
     Raises:
-        FileNotFoundError: saying so.
+        FileNotFoundError: there is no home folder.
     """
     told = os.environ.get("WARP_CACHE_PATH") or os.environ.get("XDG_CACHE_HOME")
     if not told and os.path.expanduser("~") == "~":
@@ -52,7 +52,7 @@ def _check_home() -> None:
 
 
 def _init() -> OSError | None:
-    """Initialise; where no kernels can be kept they go into a passing folder. Return why not."""
+    """Initialise; if the kernel cache cannot be used, use a temporary one and return the error."""
     try:
         _check_home()
         wp.init()
@@ -79,11 +79,11 @@ if _refused is not None:
 
 
 def roomy_zeros(shape: int | tuple[int, ...], dtype: Any, device: str) -> Any:
-    """Zeros of a Warp type, of which a CPU gives memory to what is written alone.
+    """Zeros of a Warp type for which a CPU allocates memory only where it is written.
 
-    For arrays that have room for far more than they will hold. Warp writes all of its zeros: for
-    the four million surfels of a home's map 703 MB in 0.5 s, here 3 MB in 4 ms. The memory is
-    asked of the system: ``np.zeros`` may take it from what the process freed, and then writes it.
+    For arrays with far more room than they will use. Warp writes all of its zeros: 703 MB in 0.5 s
+    for the four million surfels of a home's map, compared with 3 MB in 4 ms here. The memory comes
+    directly from the system, because ``np.zeros`` may reuse freed memory and then write zeros.
     """
     if not wp.get_device(device).is_cpu:
         return wp.zeros(shape, dtype=dtype, device=device)
@@ -94,35 +94,35 @@ def roomy_zeros(shape: int | tuple[int, ...], dtype: Any, device: str) -> Any:
     private = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
     memory = mmap.mmap(-1, max(count * scalar.itemsize, 1), flags=private)
     if hasattr(mmap, "MADV_HUGEPAGE"):
-        memory.madvise(mmap.MADV_HUGEPAGE)  # as NumPy does for what is large
+        memory.madvise(mmap.MADV_HUGEPAGE)  # as NumPy does for large arrays
     values = np.frombuffer(memory, scalar, count).reshape(full)
     return wp.array(values, dtype=dtype, device=device, copy=False)
 
 
 class HostDeviceBuffer:
-    """A device array; on a CPU the host works on its memory.
+    """A device array; on a CPU, the host accesses its memory directly.
 
-    There ``assign`` and ``numpy`` of a small array cost 5 to 15 microseconds a call, most of it
-    for finding out what the array is; here that is done once.
+    On a CPU, ``assign`` and ``numpy`` of a small array take 5 to 15 microseconds per call, mostly
+    to inspect the array; here that is done once.
 
     Attributes:
-        array: the device array, zeros at first.
+        array: the device array, initially zeros.
     """
 
     def __init__(self, shape: int | tuple[int, ...], dtype: Any, device: str) -> None:
         self.array = wp.zeros(shape, dtype=dtype, device=device)
-        self._values: NDArray[Any] = self.array.numpy()  # on a CPU its memory, else a copy
+        self._values: NDArray[Any] = self.array.numpy()  # its memory on a CPU, otherwise a copy
         self._is_shared = wp.get_device(device).is_cpu
 
     def write(self, values: ArrayLike) -> None:
-        """Set all values; on every device they are broadcast to the shape of the array.
+        """Set all values, broadcast to the shape of the array.
 
         Raises:
             ValueError: values that cannot be broadcast to it.
         """
         np.copyto(self._values, values)
         if not self._is_shared:
-            # Given fewer values, `assign` would fill the beginning of the array, and say nothing.
+            # With fewer values, `assign` would silently fill only the beginning of the array.
             self.array.assign(self._values)
 
     def zero(self) -> None:
@@ -133,7 +133,7 @@ class HostDeviceBuffer:
             self.array.zero_()
 
     def look(self) -> NDArray[Any]:
-        """The values until they change; not to be written to."""
+        """The values, valid until they change; do not write to them."""
         return self._values if self._is_shared else self.array.numpy()
 
     def read(self) -> NDArray[Any]:
@@ -142,17 +142,17 @@ class HostDeviceBuffer:
 
 
 class RecordedLaunch:
-    """A launch to be repeated, whose arguments are packed once.
+    """A repeatable kernel launch whose arguments are packed once.
 
-    Warp's own recorded launch writes them into a structure anew each time: 2.9 microseconds on one
-    core of an AMD EPYC for seven arguments, where the call of the kernel takes 0.15. Only structs
-    are written anew here too, because their fields may have been set since. On a GPU it is Warp's.
+    Warp's own recorded launch repacks the arguments each time: 2.9 microseconds for seven arguments
+    on one core of an AMD EPYC, compared with 0.15 for the kernel call. Here only structs are
+    repacked, because their fields may have changed. On a GPU, Warp's recorded launch is used.
     """
 
     def __init__(
         self, kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device: str
     ) -> None:
-        """Record; nothing is launched yet."""
+        """Record the launch without running it."""
         self._command = wp.launch(kernel, dim=dim, inputs=inputs, device=device, record_cmd=True)
         self._inputs = list(inputs)
         self._names = [argument.label for argument in kernel.adj.args]
@@ -161,7 +161,7 @@ class RecordedLaunch:
         self._structs: dict[str, ctypes.Structure] = {}
 
     def launch(self) -> None:
-        """Launch."""
+        """Launch the kernel."""
         if not self._is_on_cpu:
             self._command.launch()
             return
@@ -172,15 +172,15 @@ class RecordedLaunch:
         self._call(*self._pointers)
 
     def takes(self, name: str) -> bool:
-        """Whether the kernel has an argument of that name."""
+        """Whether the kernel has an argument called ``name``."""
         return name in self._names
 
     def set_param(self, name: str, value: Any) -> None:
-        """Launch with another argument from now on."""
+        """Change an argument for all later launches."""
         index = self._names.index(name)
         if self._inputs[index] is value:
             return
-        self._inputs[index] = value  # which keeps arrays alive
+        self._inputs[index] = value  # keeps arrays alive
         self._command.set_param_at_index(index, value)
         if name in self._structs:
             self._structs[name] = self._command.params[1 + index]

@@ -1,4 +1,4 @@
-"""Colour brought into the depth camera."""
+"""Registration of colour images to the depth camera."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from ms_slam_env.config import Checked, bounded
 
 @dataclass(frozen=True)
 class Registration(Checked):
-    """Where the colour camera is, as seen from the depth camera; the axes of both are parallel.
+    """Pose of the colour camera relative to the depth camera, with parallel axes.
 
-    The defaults are those commonly given for a Kinect that nobody calibrated, as in 7-Scenes:
-    focal length 525 px for colour (OpenNI's default) and 585 px for depth (the dataset's page),
-    colour 2.5 cm to the right of depth.
+    The defaults are those commonly used for an uncalibrated Kinect, as in 7-Scenes: focal length
+    525 px for colour (OpenNI's default) and 585 px for depth (the dataset's page), colour camera
+    2.5 cm to the right of the depth camera.
 
     Attributes:
         focal_ratio: focal length of the colour camera over that of the depth camera.
-        baseline_m: the colour camera stands so far along the depth camera's x.
-        shift_x_px: the colour image lies so many pixels too far to the right, at the size on disk.
-        shift_y_px: and so many too far down.
+        baseline_m: position of the colour camera along the depth camera's x.
+        shift_x_px: pixels by which the colour image is too far to the right, at the size on disk.
+        shift_y_px: pixels by which it is too far down, at the size on disk.
     """
 
     focal_ratio: float = bounded(525.0 / 585.0, 0.1, 10.0)
@@ -40,18 +40,18 @@ class Registration(Checked):
         intrinsics: Intrinsics,
         factor: float = 1.0,
     ) -> NDArray[np.uint8]:
-        """Colour image (H, W, 3) as the depth camera would see it.
+        """Resample the colour image (H, W, 3) to the depth camera's view.
 
-        Every pixel takes the colour at the place where its point lies in the colour camera. A pixel
-        without depth borrows that of the nearest reading; where there is none at all the offset
-        of the cameras is neglected. What the colour camera does not see takes the colour of the
-        image's border; what is hidden from it takes the colour of what hides it.
+        Every pixel takes the colour at its point's projection in the colour camera. A pixel without
+        depth uses that of the nearest reading; without any reading the cameras' offset is
+        neglected. Points outside the colour image take the colour of its border; occluded points
+        take the colour of what occludes them.
 
         Args:
             color: (H, W, 3) as recorded.
             depth: (H, W) metres, 0 = no reading.
-            intrinsics: of the depth camera, at the size of the images.
-            factor: this size over the size on disk.
+            intrinsics: intrinsics of the depth camera, at the size of the images.
+            factor: ratio of this size to the size on disk.
         """
         K = intrinsics
         v, u = np.mgrid[: K.height, : K.width].astype(np.float32)
@@ -68,7 +68,7 @@ class Registration(Checked):
         return registered.astype(np.uint8, copy=False)
 
     def __str__(self) -> str:
-        """Return what is assumed, for a report."""
+        """Describe the assumptions, for a report."""
         return (
             f"colour brought into the depth camera: focal ratio {self.focal_ratio:.4g}, baseline "
             f"{100 * self.baseline_m:g} cm, shift {self.shift_x_px:g}, {self.shift_y_px:g} px"
@@ -77,22 +77,22 @@ class Registration(Checked):
 
 @dataclass(frozen=True, eq=False)
 class ColorCamera:
-    """A colour camera that is calibrated and whose place beside the depth camera is known.
+    """A calibrated colour camera with known pose relative to the depth camera.
 
     Attributes:
-        intrinsics: of its images on disk.
-        T_color_depth: (4, 4) maps points of the depth camera into its frame.
+        intrinsics: intrinsics of its images on disk.
+        T_color_depth: (4, 4) maps points from the depth camera's frame into its own.
     """
 
     intrinsics: Intrinsics
     T_color_depth: NDArray[np.float64]
 
     def __eq__(self, other: object) -> bool:
-        """Whether both say the same."""
+        """Whether both have the same values."""
         return isinstance(other, ColorCamera) and self._key == other._key
 
     def __hash__(self) -> int:
-        """Of what it says."""
+        """Hash of the values."""
         return hash(self._key)
 
     @property
@@ -102,12 +102,12 @@ class ColorCamera:
     def register(
         self, color: NDArray[np.uint8], depth: NDArray[np.float32], camera: Intrinsics
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Colour image (H, W, 3) as the depth camera would see it, as `Registration.register` does.
+        """Resample the colour image (H, W, 3) to the depth camera's view; see `Registration`.
 
-        And (H, W) whether the colour camera sees what a pixel shows.
+        Also return a mask (H, W) of the pixels that the colour camera sees.
 
         Args:
-            color: as recorded, of the size that ``intrinsics`` say.
+            color: as recorded, of the size of ``intrinsics``.
             depth: (H, W) metres, 0 = no reading.
             camera: intrinsics of the depth camera.
         """
@@ -124,7 +124,7 @@ class ColorCamera:
         return registered.astype(np.uint8, copy=False), is_seen & is_ahead
 
     def __str__(self) -> str:
-        """Return what is assumed, for a report."""
+        """Describe the assumptions, for a report."""
         place = ", ".join(f"{100 * v:.4g}" for v in self.T_color_depth[:3, 3])
         turn = np.degrees(np.linalg.norm(cv2.Rodrigues(self.T_color_depth[:3, :3])[0]))
         K = self.intrinsics
@@ -140,14 +140,14 @@ def _rays(camera: Intrinsics) -> NDArray[np.float64]:
 
 
 def _inverse_depth(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """1 / depth (H, W), of the nearest reading where there is none; 0 without any reading."""
+    """1 / depth (H, W), filled from the nearest reading; 0 without any reading."""
     is_read = depth > 0
     if not is_read.any():
         return np.zeros_like(depth)
     inverse = (1.0 / np.where(is_read, depth, 1)).astype(np.float32)
     if is_read.all():
         return inverse
-    # Every pixel with a reading is a zero pixel with a label of its own.
+    # Every pixel with a reading is a zero pixel with its own label.
     _, nearest = cv2.distanceTransformWithLabels(
         (~is_read).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )

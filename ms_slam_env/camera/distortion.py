@@ -1,6 +1,6 @@
-"""How a lens bends a pinhole camera's image, as OpenCV writes it, and how images are straightened.
+"""Lens distortion in OpenCV's conventions, and its inverse.
 
-Models, of a ray (x, y, 1) with r = |(x, y)| and theta = atan r:
+Models for a ray (x, y, 1) with r = |(x, y)| and theta = atan r:
 
     radial-tangential  (x, y) (1 + k1 r^2 + k2 r^4 + k3 r^6)
                        + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y)
@@ -8,7 +8,7 @@ Models, of a ray (x, y, 1) with r = |(x, y)| and theta = atan r:
     equidistant        (x, y) / r theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
 
 Sources: Brown, "Close-range camera calibration" (1971); Kannala and Brandt (PAMI 2006); OpenCV's
-``calib3d`` and ``fisheye``, which these are tested against.
+``calib3d`` and ``fisheye``, against which this module is tested.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.errors import InputError, unknown
 
-_LARGEST = 20.0  # of any coefficient, more than calibrations have
-_LARGEST_RATIONAL = 1000.0  # those above and below the line cancel out
-_STEPS = 30  # of Newton's method; from the bent point, most lenses need five
+_LARGEST = 20.0  # limit of any coefficient, larger than in calibrations
+_LARGEST_RATIONAL = 1000.0  # numerator and denominator cancel out
+_STEPS = 30  # of Newton's method from the distorted point; most lenses need five
 _CONVERGED = 1e-9
 
 NAMES = {
@@ -33,7 +33,7 @@ NAMES = {
     "equidistant": ("k1", "k2", "k3", "k4"),
     "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-"""Model to its coefficients in the order in which calibration files list them."""
+"""Coefficients of each model, in the order in which calibration files list them."""
 
 ALIASES = {
     "radtan": "radial-tangential",
@@ -42,26 +42,27 @@ ALIASES = {
     "fisheye": "equidistant",
     "kannala_brandt": "equidistant",
 }
-"""What others call the models."""
+"""Other names of the models."""
 
 
 @dataclass(frozen=True)
 class Distortion(Checked):
-    """A lens; by default none.
+    """Lens distortion; none by default.
 
     Attributes:
         model: none, radial-tangential, rational (eight numbers) or equidistant (a fisheye).
-        k1: of r^2 or theta^2,
-        k2: of the fourth power,
-        p1: tangential, as is
-        p2: both not of equidistant,
-        k3: of the sixth power,
-        k4: of the eighth, equidistant; of r^2 below the line, rational; as are
-        k5: of the fourth,
-        k6: and of the sixth power.
+        k1: coefficient of r^2 or theta^2.
+        k2: coefficient of the fourth power.
+        p1: first tangential coefficient; not in equidistant.
+        p2: second tangential coefficient; not in equidistant.
+        k3: coefficient of the sixth power.
+        k4: equidistant: coefficient of the eighth power; rational: of r^2 in the denominator.
+        k5: rational: coefficient of r^4 in the denominator.
+        k6: rational: coefficient of r^6 in the denominator.
 
     Raises:
-        InputError: an unknown model, a coefficient out of range, or one that the model has not.
+        InputError: an unknown model, a coefficient out of range, or one that the model does not
+            have.
     """
 
     model: str = chosen("none", "none", *NAMES)
@@ -75,7 +76,7 @@ class Distortion(Checked):
     k6: float = bounded(0.0, -_LARGEST_RATIONAL, _LARGEST_RATIONAL)
 
     def __post_init__(self) -> None:
-        """Refuse what the model has not."""
+        """Refuse coefficients that the model does not have."""
         super().__post_init__()
         own = NAMES.get(self.model, ())
         for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"):
@@ -88,9 +89,9 @@ class Distortion(Checked):
 
     @staticmethod
     def of(model: str, coefficients: Sequence[float]) -> Distortion:
-        """The lens of a model, or of an alias of it, and its coefficients in order; zeros follow.
+        """Make a distortion from a model or its alias and ordered coefficients; the rest are 0.
 
-        No distortion where all are zero, unless the model is equidistant.
+        All zeros mean no distortion, unless the model is equidistant.
 
         Raises:
             InputError: an unknown model, or more coefficients than it has.
@@ -109,11 +110,11 @@ class Distortion(Checked):
         return Distortion(name, **dict(pairs))
 
     def __bool__(self) -> bool:
-        """Whether there is any."""
+        """Whether there is any distortion."""
         return self.model != "none"
 
     def distort(self, points: ArrayLike) -> Float64:
-        """Where rays (..., 2) with z = 1 appear, before focal length and centre (..., 2)."""
+        """Distort rays (..., 2) with z = 1, before focal length and centre are applied."""
         p = np.asarray(points, dtype=np.float64)
         if self.model == "none":
             return p
@@ -130,13 +131,13 @@ class Distortion(Checked):
         """The inverse of ``distort``, by Newton's method.
 
         Raises:
-            InputError: a point that no ray in front of the camera leads to.
+            InputError: a point that no ray in front of the camera maps to.
         """
         bent = np.asarray(points, dtype=np.float64)
         if self.model == "none":
             return bent
         found = bent.copy()
-        with np.errstate(all="ignore"):  # what diverges is refused below
+        with np.errstate(all="ignore"):  # divergence is refused below
             for _ in range(_STEPS):
                 rest = self.distort(found) - bent
                 xx, xy, yy = self._jacobian(found)
@@ -151,7 +152,7 @@ class Distortion(Checked):
         return found
 
     def is_one_to_one(self, points: ArrayLike) -> bool:
-        """Whether the image is nowhere folded at rays (..., 2) with z = 1."""
+        """Whether the distortion does not fold the image at rays (..., 2) with z = 1."""
         if self.model == "none":
             return True
         xx, xy, yy = self._jacobian(np.asarray(points, dtype=np.float64))
@@ -174,7 +175,7 @@ class Distortion(Checked):
             return above, slope
         below = 1 + s * (self.k4 + s * (self.k5 + s * self.k6))
         falling = self.k4 + s * (2 * self.k5 + s * 3 * self.k6)
-        with np.errstate(all="ignore"):  # where nothing is below the line, no ray leads
+        with np.errstate(all="ignore"):  # no ray maps to a zero denominator
             ratio = above / below
             return ratio, (slope - ratio * falling) / below
 

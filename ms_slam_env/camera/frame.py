@@ -1,4 +1,4 @@
-"""One RGB-D frame, and smaller images of it."""
+"""RGB-D frames, and reduction of their images."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RGBDFrame:
     timestamp: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse frames that would poison what follows."""
+        """Refuse invalid frames, which would corrupt later steps."""
         for name in ("color", "depth"):
             if not isinstance(getattr(self, name), np.ndarray):
                 kind = type(getattr(self, name)).__name__
@@ -53,20 +53,20 @@ class RGBDFrame:
 
 
 def check_camera(intrinsics: object) -> None:
-    """Refuse what is no camera.
+    """Refuse anything but a camera.
 
     Raises:
-        InputError: naming what it is.
+        InputError: it names the type.
     """
     if not isinstance(intrinsics, Intrinsics):
         raise InputError(f"a camera must be an Intrinsics, got a {type(intrinsics).__name__}")
 
 
 def check_frame(frame: object, intrinsics: Intrinsics) -> None:
-    """Refuse what is no frame of a camera.
+    """Refuse anything but a frame of this camera.
 
     Raises:
-        InputError: naming what it is, or both sizes.
+        InputError: it names the type, or both sizes.
     """
     if not isinstance(frame, RGBDFrame):
         raise InputError(f"a frame must be an RGBDFrame, got a {type(frame).__name__}")
@@ -74,7 +74,7 @@ def check_frame(frame: object, intrinsics: Intrinsics) -> None:
 
 
 def check_readings(depth: NDArray[np.floating]) -> None:
-    """Refuse depth that would poison what follows.
+    """Refuse invalid depth, which would corrupt later steps.
 
     Raises:
         InputError: NaN, infinite or negative depth.
@@ -86,14 +86,14 @@ def check_readings(depth: NDArray[np.floating]) -> None:
 
 
 def intensity_image(image: ArrayLike) -> NDArray[np.uint8]:
-    """Grey image (H, W) uint8 of a colour image (H, W, 3) uint8 (BT.601); grey passes through.
+    """Convert a colour image (H, W, 3) uint8 to grey (H, W) uint8 (BT.601); grey passes through.
 
     Raises:
-        InputError: another shape or type.
+        InputError: a wrong shape or type.
     """
     try:
         array = np.asarray(image)
-    except ValueError:  # rows of several lengths
+    except ValueError:  # rows of different lengths
         raise InputError("an image must be an array") from None
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3):
         raise InputError(f"an image must be (H, W) or (H, W, 3), got {array.shape}")
@@ -104,23 +104,23 @@ def intensity_image(image: ArrayLike) -> NDArray[np.uint8]:
     return np.rint(array.astype(np.float32) @ _LUMA).astype(np.uint8)
 
 
-_SAME_SURFACE = 0.03  # of the depth; readings further apart are taken for different surfaces
+_SAME_SURFACE = 0.03  # relative depth difference above which readings are different surfaces
 
 
 def reduce_color(color: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Colour image at ``size`` (width, height): the mean of what each pixel covers."""
+    """Reduce colour to ``size`` (width, height): each pixel is the mean of what it covers."""
     import cv2
 
     return cv2.resize(color, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
 
 
 def reduce_depth(depth: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """Depth image at ``size`` (width, height): the mean of the readings of one surface.
+    """Reduce depth to ``size`` (width, height): each pixel is the mean over one surface.
 
-    The surface is that of the reading nearest to the centre of the pixels covered; readings that
-    differ from it by more than 3 % are left out, so nothing is read between two surfaces. Without
-    a reading there the pixel has none. A size that does not divide the image's takes the reading
-    alone, because the pixels covered are then not the same number everywhere.
+    The surface is that of the covered pixel nearest to their centre. Readings that differ from it
+    by more than 3 % are left out, so none falls between two surfaces. If that pixel has no reading,
+    neither has the result. If ``size`` does not divide the image's, that reading alone is used,
+    because the number of covered pixels then varies.
     """
     import cv2
 

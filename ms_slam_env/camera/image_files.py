@@ -1,4 +1,4 @@
-"""Image files: of the documented formats and of the size they should have, checked before."""
+"""Reads image files, after checking their format and size."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ms_slam_env.camera.intrinsics import Intrinsics
 from ms_slam_env.errors import InputError
 
 SUFFIXES = (".png", ".pgm", ".jpg", ".jpeg", ".ppm", ".tif", ".tiff")
-"""Endings of the names of images."""
+"""Suffixes of image file names."""
 
 _FORMATS = ("PNG", "JPEG", "PPM", "TIFF")
 
@@ -27,7 +27,7 @@ _DEPTH = ("I;16", "I;16B", "I;16L", "I")
 _COLOR = ("RGB", "RGBA", "L", "LA", "P", "CMYK")
 _GREY = (*_COLOR, *_DEPTH)
 
-# What Pillow raises for files that are truncated or damaged, format by format.
+# Errors that Pillow raises for truncated or damaged files, depending on the format.
 _BROKEN = (
     OSError,
     SyntaxError,
@@ -45,17 +45,17 @@ _BROKEN = (
 
 
 def read_color(path: Path, intrinsics: Intrinsics) -> NDArray[np.uint8]:
-    """Colour image (H, W, 3) in RGB; grey ones and those with a palette are converted.
+    """Read a colour image (H, W, 3) in RGB; grey and palette images are converted.
 
     Raises:
-        InputError: no such file, no image of a documented format, one that is damaged, or one that
-            has another size than ``intrinsics`` say.
+        InputError: no such file, not an image of a documented format, a damaged one, or one whose
+            size differs from ``intrinsics``.
     """
     return decode_color(_bytes(path, "colour image"), str(path), intrinsics)
 
 
 def read_grey(path: Path, intrinsics: Intrinsics) -> NDArray[np.uint8]:
-    """As `read_color`, of a camera without depth: grey of 16 bits, as in TUM-VI, is rounded to 8.
+    """Read an image of a camera without depth; 16-bit grey, as in TUM-VI, is rounded to 8 bits.
 
     Raises:
         InputError: as `read_color`.
@@ -68,21 +68,21 @@ def read_grey(path: Path, intrinsics: Intrinsics) -> NDArray[np.uint8]:
 
 
 def read_depth(path: Path, intrinsics: Intrinsics) -> NDArray[Any]:
-    """Values (H, W) of a depth image with 16 bits or more.
+    """Read the values (H, W) of a depth image with 16 bits or more.
 
     Raises:
-        InputError: as `read_color`; 8 bits, which would be depth in steps of centimetres.
+        InputError: as `read_color`, or 8 bits, which would be depth in steps of centimetres.
     """
     return decode_depth(_bytes(path, "16-bit depth image"), str(path), intrinsics)
 
 
 def decode_color(data: bytes, name: str, intrinsics: Intrinsics) -> NDArray[np.uint8]:
-    """As `read_color`, of what a file holds; ``name`` is for errors."""
+    """`read_color` for the content of a file; ``name`` is for error messages."""
     return _decode(data, name, "colour image", _COLOR, intrinsics).astype(np.uint8, copy=False)
 
 
 def decode_depth(data: bytes, name: str, intrinsics: Intrinsics) -> NDArray[Any]:
-    """As `read_depth`, of what a file holds; ``name`` is for errors."""
+    """`read_depth` for the content of a file; ``name`` is for error messages."""
     return _decode(data, name, "16-bit depth image", _DEPTH, intrinsics)
 
 
@@ -90,7 +90,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file.
 
     Raises:
-        InputError: no such file, or no image of a documented format.
+        InputError: no such file, or not an image of a documented format.
     """
     try:
         with Image.open(io.BytesIO(_bytes(path, "image")), formats=_FORMATS) as image:
@@ -109,7 +109,7 @@ def _decode(
     data = io.BytesIO(content)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is wrong with the file is said below
+            warnings.simplefilter("ignore")  # problems are reported below
             with Image.open(data, formats=_FORMATS) as image:
                 check_size(path, image.size, intrinsics)
                 if image.mode not in modes:
@@ -124,10 +124,10 @@ def _decode(
 
 
 def check_size(path: str, size: tuple[int, int], intrinsics: Intrinsics) -> None:
-    """Refuse an image ``path`` of another size (width, height) than the intrinsics say.
+    """Refuse an image ``path`` whose size (width, height) differs from the intrinsics.
 
     Raises:
-        InputError: naming both sizes.
+        InputError: it names both sizes.
     """
     if size != (intrinsics.width, intrinsics.height):
         raise InputError(
@@ -142,23 +142,23 @@ _MAX_TEXTURE = 1024
 
 
 def decode_texture(data: bytes, name: str) -> NDArray[np.uint8]:
-    """Image (h, w, 3) in RGB of a mesh's texture, shrunk to at most 1024 pixels a side.
+    """Decode a mesh's texture to RGB (h, w, 3), shrunk to at most 1024 pixels per side.
 
     Args:
-        data: what the file holds.
-        name: for errors.
+        data: content of the file.
+        name: name for error messages.
 
     Raises:
-        InputError: no image of a common format, damaged, or of more than 8192 x 8192 pixels.
+        InputError: not an image of a common format, damaged, or larger than 8192 x 8192 pixels.
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is wrong with the file is said below
+            warnings.simplefilter("ignore")  # problems are reported below
             with Image.open(io.BytesIO(data), formats=_TEXTURES) as image:
                 width, height = image.size
                 if width * height > _MAX_TEXELS:
                     raise InputError(f"{name} has {width}x{height} pixels: more than 8192x8192")
-                deep = image.mode.startswith("I")  # 16 bits, which Pillow would cut off at 255
+                deep = image.mode.startswith("I")  # 16 bits, which Pillow would clip at 255
                 grey = (
                     Image.fromarray((np.asarray(image) // 256).astype(np.uint8)) if deep else image
                 )

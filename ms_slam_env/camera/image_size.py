@@ -1,8 +1,8 @@
-"""Sizes of images by name, and which part of an image is taken before it is reduced.
+"""Image sizes by name, with an optional crop before the reduction.
 
-``160x120`` reduces whole images, which must have that aspect. ``160x120+crop`` takes the largest
-central part that has it, ``160x120+crop=480x360`` the central part of that size; ``native`` in
-place of the size reduces nothing.
+``160x120`` reduces whole images, which must have that aspect ratio. ``160x120+crop`` takes the
+largest central part with that ratio, ``160x120+crop=480x360`` the central part of that size;
+``native`` instead of a size means no reduction.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from ms_slam_env.camera.intrinsics import LARGEST_SIDE, XTION_SIZES, Intrinsics
 from ms_slam_env.errors import InputError, unknown
 
 NATIVE = "native"
-"""The size that keeps the images' own."""
+"""Keyword for the images' own size."""
 
 SMALLEST_SIDE = 8
-"""Pixels; below, nothing can be tracked."""
+"""In pixels; smaller images cannot be tracked."""
 
 _PIXELS = r"[0-9]{1,5}x[0-9]{1,5}"
 _FORM = re.compile(f"(?P<size>native|{_PIXELS})(?P<crop>[+]crop(?:=(?P<part>{_PIXELS}))?)?")
@@ -32,12 +32,12 @@ _CHOICES = (
 
 
 class ImageSizeError(InputError):
-    """Images that cannot be brought to the size that was asked for."""
+    """The images cannot be brought to the requested size."""
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A part of an image, in its pixels: from ``left``, ``top`` on, ``width`` x ``height``."""
+    """A part of an image in pixels: ``width`` x ``height``, starting at ``left``, ``top``."""
 
     left: int
     top: int
@@ -47,13 +47,13 @@ class Crop:
 
 @dataclass(frozen=True)
 class ImageSize:
-    """A size as it was named.
+    """A parsed image size.
 
     Attributes:
         size: (width, height) to reduce to; None keeps the pixels.
-        crop: (width, height) of the central part that is taken before; None for all that has the
-            aspect of ``size``.
-        crops: whether anything may be cut away.
+        crop: (width, height) of the central part to take first; None for the largest with the
+            aspect ratio of ``size``.
+        crops: whether cropping is allowed.
     """
 
     size: tuple[int, int] | None
@@ -61,15 +61,15 @@ class ImageSize:
     crops: bool = False
 
     def part_of(self, source: Intrinsics, name: str) -> Crop:
-        """What is taken of an image of ``source``.
+        """The part to take of an image of ``source``.
 
         Args:
             source: intrinsics of the whole image.
-            name: of the thing that has these images, for the error message.
+            name: name of the images' owner, for error messages.
 
         Raises:
-            ImageSizeError: a part or a size that is larger, or whole images of another aspect;
-                the message says what would do.
+            ImageSizeError: the part or size is larger than the image, or a whole image has another
+                aspect ratio; the message says what is valid.
         """
         whole, fitting = (source.width, source.height), self._fitting(source)
         if self.crop is not None and (self.crop[0] > whole[0] or self.crop[1] > whole[1]):
@@ -88,13 +88,13 @@ class ImageSize:
         return Crop((whole[0] - part[0]) // 2, (whole[1] - part[1]) // 2, *part)
 
     def _fitting(self, source: Intrinsics) -> tuple[int, int]:
-        """The largest part of an image of ``source`` that has this aspect."""
+        """The largest part of an image of ``source`` with this aspect ratio."""
         width, height = self.size or (source.width, source.height)
         scale = min(source.width / width, source.height / height)
         return round(width * scale), round(height * scale)
 
     def _reduces(self, part: tuple[int, int]) -> bool:
-        """Whether an image of this size is ``part`` reduced, to half a pixel."""
+        """Whether ``part`` reduces to this size, to within half a pixel."""
         if self.size is None:
             return True
         width, height = self.size
@@ -107,10 +107,10 @@ def _text(size: tuple[int, int]) -> str:
 
 
 def parse_image_size(text: str) -> ImageSize:
-    """The size that ``text`` names, as this module describes.
+    """Parse a size in the notation of this module.
 
     Raises:
-        InputError: it names none; the message says what may stand there.
+        InputError: not a size; the message says what is valid.
     """
     found = _FORM.fullmatch(text) if isinstance(text, str) else None
     if found is None:
@@ -130,10 +130,10 @@ def _pixels(text: str | None) -> tuple[int, int] | None:
 
 
 def rendered_size(text: str) -> tuple[int, int]:
-    """(width, height) of images that are made as ``text`` asks, so that there is nothing to crop.
+    """Parse a size (width, height) for rendered images, which need no crop.
 
     Raises:
-        InputError: no size, ``native``, or a part of a size of its own.
+        InputError: not a size, ``native``, or a crop of a given size.
     """
     named = parse_image_size(text)
     if named.size is None or named.crop is not None:
@@ -147,8 +147,9 @@ def rendered_size(text: str) -> tuple[int, int]:
 def xtion(size: str = "160x120") -> Intrinsics:
     """Intrinsics of the ASUS Xtion Pro Live, scaled to ``size``.
 
-    570.3 px at 640x480 is the focal length of the OpenNI driver's default calibration
-    (58 x 45 degrees field of view). Of another aspect than 4:3 it is the central part that has it.
+    570.3 px at 640x480 is the focal length of the OpenNI driver's default calibration (58 x 45
+    degrees field of view). For an aspect ratio other than 4:3 it is the central part with that
+    ratio.
 
     Raises:
         InputError: unknown size.
@@ -159,11 +160,11 @@ def xtion(size: str = "160x120") -> Intrinsics:
 
 
 def pinhole(size: str, field_of_view_deg: float | None = None) -> Intrinsics:
-    """A camera with square pixels and its axis in the middle of the image.
+    """Make a camera with square pixels and its axis at the image centre.
 
     Args:
-        size: of the image, as ``xtion`` takes it.
-        field_of_view_deg: from the left edge to the right one; None for the Xtion's own.
+        size: size of the image, as for ``xtion``.
+        field_of_view_deg: horizontal field of view; None for the Xtion's.
 
     Raises:
         InputError: unknown size, or an angle outside [10, 150].

@@ -1,4 +1,4 @@
-"""Intrinsics of a pinhole camera, with a lens or without; pixel centres lie at integers."""
+"""Pinhole intrinsics with optional lens distortion; pixel centres lie at integers."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ XTION_SIZES: dict[str, tuple[int, int]] = {
     "320x240": (320, 240),
     "640x480": (640, 480),
 }
-"""Image sizes of the simulated ASUS Xtion, name to (width, height)."""
+"""Image sizes (width, height) of the simulated ASUS Xtion, by name."""
 
 LARGEST_SIDE = 4096
-"""Pixels of a side of an image, more than any RGB-D camera has."""
+"""Largest image side in pixels, more than any RGB-D camera has."""
 
 SMALLEST_LEVEL = 2
-"""Pixels of a side of the coarsest level of a pyramid: what interpolation needs."""
+"""Smallest side of a pyramid level in pixels: what interpolation needs."""
 
 LARGEST_NUMBER = 1e6
-"""Largest focal length, and farthest centre from the corner, in pixels; the least focal length is
-its inverse."""
+"""Largest focal length and centre coordinate, pixels; the smallest focal length is its inverse."""
 
 
 @dataclass(frozen=True)
 class Intrinsics:
     """Pinhole camera: u = fx x / z + cx, v = fy y / z + cy, in pixels.
 
-    With a lens (x, y) / z is bent before (`Distortion.distort`). SLAM and divergence want none:
-    images are straightened first (`ms_slam_env.camera.undistortion`), as recordings are on reading.
+    With lens distortion, (x, y) / z is distorted first (`Distortion.distort`). SLAM and divergence
+    need undistorted images (`ms_slam_env.camera.undistortion`); recordings are undistorted on
+    reading.
 
     Raises:
-        InputError: a side below 1 or above `LARGEST_SIDE` pixels, focal lengths or a centre that
-            no camera has, or a lens that folds what the camera without it would see.
+        InputError: a side below 1 or above `LARGEST_SIDE` pixels, focal lengths or a centre that no
+            camera has, or a distortion that folds the field of view.
     """
 
     fx: float
@@ -85,14 +85,14 @@ class Intrinsics:
 
     @property
     def undistorted(self) -> Intrinsics:
-        """The same camera without a lens."""
+        """The same camera without distortion."""
         return replace(self, distortion=NO_DISTORTION) if self.distortion else self
 
     def check_pinhole(self, what: str) -> None:
-        """Refuse a lens.
+        """Refuse lens distortion.
 
         Raises:
-            InputError: naming ``what`` cannot work with one.
+            InputError: ``what`` does not support it.
         """
         if self.distortion:
             raise InputError(
@@ -101,7 +101,7 @@ class Intrinsics:
             )
 
     def every_nth(self, n: int) -> Intrinsics:
-        """Intrinsics of the image that keeps every ``n``-th row and column, from the first on.
+        """Intrinsics after keeping every ``n``-th row and column, starting with the first.
 
         Raises:
             InputError: ``n`` below 1.
@@ -136,11 +136,11 @@ class Intrinsics:
     def level_size(self, level: int) -> tuple[int, int]:
         """(width, height) of level ``level`` of an image pyramid; level 0 is the image itself.
 
-        A pixel of a level is a whole block of 2x2 of the one below; a column or row left over at
-        the right or the bottom is dropped. All pyramids ask here.
+        A pixel of a level is a whole 2x2 block of the level below; a leftover column or row at the
+        right or bottom is dropped. All pyramids use this.
 
         Raises:
-            InputError: the level would have a side of less than `SMALLEST_LEVEL` pixels.
+            InputError: a side of the level would be below `SMALLEST_LEVEL` pixels.
         """
         width, height = self.width >> level, self.height >> level
         if min(width, height) < SMALLEST_LEVEL:
@@ -167,10 +167,10 @@ class Intrinsics:
         return Intrinsics(self.fx * x, self.fy * y, *centre, width, height, self.distortion)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Intrinsics:
-        """Intrinsics of the part of the image that begins at column ``left`` and row ``top``.
+        """Intrinsics of the part of the image that starts at column ``left`` and row ``top``.
 
         Raises:
-            InputError: the image has no such part.
+            InputError: the part is not inside the image.
         """
         fits = 0 <= left <= self.width - width and 0 <= top <= self.height - height
         if not fits:
@@ -189,7 +189,7 @@ class Intrinsics:
         """Viewing rays (..., 3) with z = 1 through pixels (..., 2), the inverse of ``project``.
 
         Raises:
-            InputError: the lens leads no ray in front of the camera to a pixel.
+            InputError: a pixel has no ray in front of the camera under this distortion.
         """
         u, v = np.moveaxis(np.asarray(pixels, dtype=np.float64), -1, 0)
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
@@ -203,7 +203,7 @@ class Intrinsics:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points: ArrayLike) -> Float64:
-        """Pixel coordinates (..., 2) of points (..., 3) of the camera frame with z > 0."""
+        """Pixel coordinates (..., 2) of points (..., 3) in the camera frame with z > 0."""
         p = np.asarray(points, dtype=np.float64)
         if self.distortion:
             bent = self.distortion.distort(p[..., :2] / p[..., 2:])
@@ -216,7 +216,7 @@ class Intrinsics:
         """Refuse an image whose height and width differ from the intrinsics.
 
         Raises:
-            InputError: naming both sizes.
+            InputError: it names both sizes.
         """
         if image.shape[:2] != self.shape:
             raise InputError(

@@ -1,4 +1,4 @@
-"""Images of a camera with a lens, as the camera without it would have taken them."""
+"""Undistortion of colour and depth images."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from ms_slam_env.camera.intrinsics import Intrinsics
 
 
 def undistort_color(image: NDArray[np.uint8], intrinsics: Intrinsics) -> NDArray[np.uint8]:
-    """Colour (H, W, 3) as ``intrinsics.undistorted`` sees it, interpolated; black beyond the image.
+    """Undistort colour (H, W, 3) by interpolation; black outside the image.
+
+    The result belongs to ``intrinsics.undistorted``.
 
     Raises:
-        InputError: an image of another size than ``intrinsics`` say.
+        InputError: the image's size differs from ``intrinsics``.
     """
     intrinsics.check_image(image, "colour")
     found = cv2.remap(image, *_maps(intrinsics), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
@@ -24,9 +26,9 @@ def undistort_color(image: NDArray[np.uint8], intrinsics: Intrinsics) -> NDArray
 
 
 def undistort_depth(image: NDArray[Any], intrinsics: Intrinsics) -> NDArray[Any]:
-    """Depth (H, W), float32 or uint16, likewise: the nearest reading, 0 beyond the image.
+    """Undistort depth (H, W), float32 or uint16, by nearest reading; 0 outside the image.
 
-    Depth is along the optical axis, which a lens leaves as it is.
+    Values do not change, because depth is measured along the optical axis.
     """
     intrinsics.check_image(image, "depth")
     return cv2.remap(image, *_maps(intrinsics), cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
@@ -34,6 +36,6 @@ def undistort_depth(image: NDArray[Any], intrinsics: Intrinsics) -> NDArray[Any]
 
 @lru_cache(maxsize=8)
 def _maps(intrinsics: Intrinsics) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Column and row (H, W) where each pixel of the straight image is found in the bent one."""
+    """Column and row (H, W) of each undistorted pixel in the distorted image."""
     places = intrinsics.project(intrinsics.undistorted.rays()).astype(np.float32)
     return np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])

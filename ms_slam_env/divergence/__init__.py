@@ -24,7 +24,7 @@ _VARIANTS: dict[str, type[Divergence]] = {
 def make_divergence(
     config: DivergenceConfig, intrinsics: Intrinsics, device: str = "cpu"
 ) -> Divergence:
-    """Return the divergence that ``config.measure`` names, for images of ``intrinsics``."""
+    """Make the divergence named by ``config.measure``, for images of ``intrinsics``."""
     check_camera(intrinsics)
     if not isinstance(config, DivergenceConfig):
         raise InputError(f"config must be a DivergenceConfig, got a {type(config).__name__}")

@@ -1,4 +1,4 @@
-"""From images to normalised histograms of intensity and normals."""
+"""Counts images into normalised histograms of intensity and normals."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ms_slam_env.divergence.sphere import MAP_SIZE, bin_directions, bins_near
 from ms_slam_env.errors import InputError
 
 _LARGEST_COPY = 1 << 18
-"""Bytes up to which copying images costs less than telling Warp of them, 20 microseconds each."""
+"""Below this many bytes, copying an image is faster than wrapping it for Warp (20 microseconds)."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Histograms:
 def grouping_matrix(bins: int, smoothing: float) -> Float64:
     """Matrix (256, bins) that smooths a histogram of grey levels and groups it into bins.
 
-    The Parzen window of a level is a Gaussian cut at the ends of the range and normalised, so
-    that every pixel keeps weight 1. Level g falls into bin floor(g bins / 256).
+    The Parzen window of a level is a Gaussian truncated at the ends of the range and normalised, so
+    that every pixel has weight 1. Level g falls into bin floor(g bins / 256).
     """
     levels = np.arange(256)
     if smoothing > 0:
@@ -66,9 +66,9 @@ def grouping_matrix(bins: int, smoothing: float) -> Float64:
 
 
 def normalise(counts: Float64, pseudo_count: float) -> Float64:
-    """Distributions (..., K) of counts (..., K), with ``pseudo_count`` added to every bin.
+    """Normalise counts (..., K) to distributions, with ``pseudo_count`` added to every bin.
 
-    Counts that are all zero give the uniform distribution: nothing is known.
+    All-zero counts give the uniform distribution.
     """
     padded = counts + pseudo_count
     return padded / padded.sum(axis=-1, keepdims=True)
@@ -88,16 +88,16 @@ class HistogramCounter:
         self._passes: dict[tuple[int, bool], _CountingPass] = {}  # by batch size, with normals
 
     def histograms(self, intensity: Any, depth: Any, normals: Any | None = None) -> Histograms:
-        """Histograms of B frames, all counted in one pass.
+        """Compute the histograms of B frames in one pass.
 
         Args:
             intensity: (B, h, w) grey values in [0, 255], NumPy or float32 Warp.
             depth: (B, h, w) metres, 0 = no reading, NumPy or float32 Warp.
-            normals: (B, h, w, 3), 0 = none, of any other length than 0 (NumPy, or Warp vec3 of
-                shape (B, h, w)); computed from depth if None.
+            normals: (B, h, w, 3) of any length, 0 = none (NumPy, or Warp vec3 of shape (B, h, w));
+                computed from depth if None.
 
         Raises:
-            InputError: shapes that do not fit each other or the intrinsics; NaN, infinite or
+            InputError: shapes that do not match each other or the intrinsics; NaN, infinite or
                 negative depth in a NumPy array.
         """
         images = {"intensity": intensity, "depth": depth}
@@ -115,7 +115,7 @@ class HistogramCounter:
         return self._normalised(*self._passes[key](images))
 
     def normals(self, depth: Any) -> NDArray[np.float32]:
-        """Unit normals (B, h, w, 3) towards the camera from depth (B, h, w); 0 where none."""
+        """Unit normals (B, h, w, 3) facing the camera from depth (B, h, w); 0 = none."""
         shape = self._checked_shape(depth, "depth")
         source = _on_device(depth, wp.float32, self._device)
         inverse = wp.empty_like(source)
@@ -127,7 +127,7 @@ class HistogramCounter:
         return result.numpy()
 
     def _checked_shape(self, array: Any, name: str) -> tuple[int, ...]:
-        """(B, h, w) of images that fit the intrinsics."""
+        """Check that images match the intrinsics; return their shape (B, h, w)."""
         shape = tuple(array.shape) if isinstance(array, wp.array) else np.shape(array)
         if name == "normals" and not isinstance(array, wp.array):
             if len(shape) != 4 or shape[3] != 3:
@@ -143,7 +143,7 @@ class HistogramCounter:
         return shape
 
     def _normalised(self, levels: Int32, weights: Float64) -> Histograms:
-        """Histograms of raw counts and of the sums of equation (9)."""
+        """Make histograms from raw counts and the sums of equation (9)."""
         pseudo_count = self.config.pseudo_count
         return Histograms(
             intensity=normalise(levels @ self._grouping, pseudo_count),
@@ -152,7 +152,7 @@ class HistogramCounter:
 
 
 class _CountingPass:
-    """Recorded launches that count B frames, and what they write to."""
+    """Recorded launches that count B frames, and their output arrays."""
 
     def __init__(
         self,
@@ -162,7 +162,7 @@ class _CountingPass:
         intrinsics: Intrinsics,
         device: str,
     ) -> None:
-        """Record; with ``has_normals`` they are given, else computed from depth."""
+        """Record the launches; normals are given if ``has_normals``, else computed from depth."""
         self._device = device
         height, width = shape = intrinsics.shape
         rows, columns = config.windows if config.measure == "windowed-kl" else (1, 1)
@@ -180,7 +180,8 @@ class _CountingPass:
         per_row = rows * columns * len(directions)
         self._levels = HostDeviceBuffer((batch, rows * columns * 256), wp.int32, device)
         self._sums = HostDeviceBuffer((batch * height * per_row,), wp.float32, device)
-        # Small images are copied to buffers of the recorded launches, large ones bound to them.
+        # Small images are copied to buffers of the recorded launches; large ones are bound
+        # directly.
         room = (1 if batch * height * width * 4 > _LARGEST_COPY else batch, *shape)
         dtypes = {"intensity": wp.float32, "depth": wp.float32}
         dtypes |= {"normals": wp.vec3} if has_normals else {}
@@ -203,7 +204,7 @@ class _CountingPass:
         self._launches = [RecordedLaunch(kernel, dim, inputs, device) for kernel, inputs in stages]
 
     def __call__(self, images: Mapping[str, Any]) -> tuple[Int32, Float64]:
-        """Counts (B, W, 256) of grey levels and sums (B, W, L) of the weights of normals, (9)."""
+        """Return counts (B, W, 256) of grey levels and sums (B, W, L) of normal weights, (9)."""
         for name, image in images.items():
             self._take(name, image)
         self._levels.zero()
@@ -218,7 +219,7 @@ class _CountingPass:
         )
 
     def _take(self, name: str, image: Any) -> None:
-        """Make the launches look at an image."""
+        """Copy or bind an image for the launches."""
         buffer = self._buffers[name]
         array = buffer.array
         if not isinstance(image, wp.array) and array.shape == np.shape(image)[:3]:
@@ -239,7 +240,7 @@ def _camera_arguments(config: DivergenceConfig, intrinsics: Intrinsics) -> list[
 
 
 def _on_device(array: Any, dtype: Any, device: str) -> Any:
-    """A contiguous Warp array; no copy on the CPU where none is needed."""
+    """Convert to a contiguous Warp array, on the CPU without a copy if possible."""
     if not isinstance(array, wp.array):
         array = np.ascontiguousarray(array, dtype=np.float32)
         array = wp.array(array, dtype=dtype, device=device, copy=False)

@@ -12,30 +12,30 @@ MEASURES = ("kl", "windowed-kl", "earth-movers")
 
 @dataclass(frozen=True)
 class DivergenceConfig(Checked):
-    """How the histograms of a frame are made and compared.
+    """How a frame's histograms are computed and compared.
 
-    The defaults are those under which the divergence predicted from the map follows the one that
-    is met (``ms-slam experiment lookahead_ranking``).
+    With the defaults, the divergence predicted from the map follows the observed one (``ms-slam
+    experiment lookahead_ranking``).
 
     Attributes:
         measure: ``kl`` (equations (5) and (10) of Saeedi et al., ICRA 2017), ``windowed-kl`` (its
-            mean over spatial windows) or ``earth-movers``; the last two are improvements that the
-            paper proposes in its section VII.
+            mean over spatial windows) or ``earth-movers``; the paper proposes the last two as
+            improvements in section VII.
         bins: intensity bins P of equation (5), 2 to 256.
-        smoothing: standard deviation of the Parzen window that smooths the intensity histogram,
-            in grey levels; 0 = none.
-        pseudo_count: pixels added to every bin before a histogram is normalised, so that no bin
-            is empty and the logarithm of (5) and (10) is finite. The paper does not say what it
-            does with empty bins.
-        intensity_pixels: ``all``, or only those ``with-depth``. In a view predicted from a map
-            the pixels without depth are holes, whose intensity (0) is not that of any surface.
+        smoothing: standard deviation in grey levels of the Parzen window that smooths the intensity
+            histogram; 0 = none.
+        pseudo_count: pixels added to every bin before normalisation, so that no bin is empty and
+            the logarithm in (5) and (10) is finite. The paper does not say how it treats empty
+            bins.
+        intensity_pixels: ``all``, or only those ``with-depth``. In a view predicted from a map,
+            pixels without depth are holes, whose intensity (0) belongs to no surface.
         inclinations: N of equation (6).
         alpha_deg: influence angle alpha of equation (8), degrees.
-        normal_reach_deg: angle, seen from the camera, to the neighbours on both sides whose depths
-            give a pixel's normal; at least one pixel. Sensor noise tilts the normals the less the
-            longer it is; as an angle it is the same surface at every image size.
-        edge_threshold: relative second difference of inverse depth above which two pixels are
-            taken to lie on different surfaces, so that no normal is computed across.
+        normal_reach_deg: viewing angle to the neighbours on both sides whose depths determine a
+            pixel's normal; at least one pixel. A larger reach makes normals less noisy. As an angle
+            it covers the same surface at every image size.
+        edge_threshold: relative second difference of inverse depth above which pixels belong to
+            different surfaces, so that no normal is computed across.
         windows: rows and columns of spatial windows (``windowed-kl`` only).
 
     Raises:
@@ -54,7 +54,7 @@ class DivergenceConfig(Checked):
     windows: tuple[int, int] = (2, 2)
 
     def __post_init__(self) -> None:
-        """Refuse values that make no histogram."""
+        """Refuse values that allow no histogram."""
         super().__post_init__()
         is_grid = isinstance(self.windows, (tuple, list)) and len(self.windows) == 2
         if not is_grid or not all(isinstance(n, int) and 1 <= n <= 16 for n in self.windows):
@@ -67,8 +67,8 @@ class DivergenceConfig(Checked):
     def paper(cls) -> DivergenceConfig:
         """The paper's own setting: 256 intensity bins, no smoothing, all pixels, plain KL.
 
-        The paper gives no numbers for N and alpha, 8 and 30 degrees are ours; normals come from
-        the next pixels.
+        The paper gives no numbers for N and alpha; 8 and 30 degrees are our choice. Normals come
+        from adjacent pixels.
         """
         return cls(
             measure="kl",

@@ -1,11 +1,11 @@
 # mypy: disable-error-code="empty-body"
 """Counting kernels: one pass over the pixels of a batch of frames.
 
-Grey levels are counted in integers and the weights of normals are summed by rows, so the result
-does not depend on the order in which a GPU adds them. One thread takes one image row: on the CPU,
-where threads run one after the other, the call of a thread costs more than a pixel does. The
-spatial window of pixel (v, u) is ``row_window[v] + column_window[u]``. Inner loops are C++: Warp's
-indexing, with any strides, takes longer than what they compute. So images must be contiguous.
+Grey levels are counted as integers and normal weights are summed per row, so the result does not
+depend on the order in which a GPU adds them. One thread handles one image row: on the CPU, where
+threads run one after another, a call costs more than a pixel. The spatial window of pixel (v, u) is
+``row_window[v] + column_window[u]``. Inner loops are in C++, because Warp's strided indexing takes
+longer than the computation. So images must be contiguous.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from ms_slam_env.native import native_source
 
 @wp.func_native(native_source("histograms", "invert_row"))
 def invert_row(depth: wp.array[wp.float32], width: int, inverse: wp.array[wp.float32]) -> None:
-    """Inverse depth of a row of pixels."""
+    """Compute the inverse depth of a row of pixels."""
 
 
 @wp.kernel
 def invert_depth(depth: wp.array3d[wp.float32], inverse: wp.array3d[wp.float32]) -> None:
-    """Inverse depth in 1/m; where there is no reading, a number too large to be one."""
+    """Compute inverse depth in 1/m; without a reading, an impossibly large number."""
     b, v = wp.tid()
     invert_row(depth[b, v], depth.shape[2], inverse[b, v])
 
@@ -38,12 +38,12 @@ def plane_normal(
     offset: wp.vec2,
     per_pixel: float,
 ) -> wp.vec3:
-    """Normal towards the camera, of any length; zero if there is none.
+    """Normal facing the camera, of any length; zero if there is none.
 
-    On the plane n . p = d the inverse depth is n . ray / d, linear in the pixel coordinates, so
-    its slopes give n / d exactly; d < 0 for a normal towards the camera. The slopes are central
-    differences of the inverse depths to both sides of ``w``. The second difference is zero on a
-    plane however tilted, so a large one shows an edge.
+    On the plane n . p = d the inverse depth is n . ray / d, linear in the pixel coordinates, so its
+    slopes give n / d exactly; d < 0 for a normal facing the camera. The slopes are central
+    differences of the inverse depths on both sides of ``w``. The second difference is zero on any
+    plane, so a large one indicates an edge.
 
     ``offset`` is the pixel minus the centre, ``per_pixel`` 1 / the distance of the neighbours.
     """
@@ -73,7 +73,7 @@ def normal_at(
     focal: wp.vec2,
     centre: wp.vec2,
 ) -> wp.vec3:
-    """Normal of pixel (v, u) of image ``b`` by its four neighbours ``radius`` pixels away."""
+    """Normal of pixel (v, u) of image ``b`` from its four neighbours at ``radius`` pixels."""
     return plane_normal(
         inverse[b, v, u],
         inverse[b, v, u - radius],
@@ -233,7 +233,7 @@ def compute_normals(
     edge_threshold: float,
     normals: wp.array3d[wp.vec3],
 ) -> None:
-    """Unit normals of a row of pixels, zero where there is none."""
+    """Compute unit normals of a row of pixels; zero = none."""
     b, v = wp.tid()
     height = inverse.shape[1]
     width = inverse.shape[2]

@@ -1,4 +1,4 @@
-"""How far frames are apart: Kullback-Leibler, its mean over windows, earth mover's distance."""
+"""Divergence measures: Kullback-Leibler, its mean over windows, earth mover's distance."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ms_slam_env.divergence.sphere import bin_directions
 
 
 class Divergence(HistogramCounter, ABC):
-    """Histograms of frames, and how far frames are apart in intensity and in depth."""
+    """Computes histograms of frames, and their divergence in intensity and depth."""
 
     def divergence(self, current: Histograms, reference: Histograms) -> Float64:
-        """Intensity and depth divergence (B, 2) of B frames from 1 or B reference frames."""
+        """Intensity and depth divergence (B, 2) of B frames from one or B reference frames."""
         return np.stack(
             [
                 self.compare_intensity(current.intensity, reference.intensity),
@@ -39,7 +39,7 @@ class Divergence(HistogramCounter, ABC):
 def kl_divergence(p: Float64, q: Float64) -> Float64:
     """KL(p || q) (...) in nats of positive distributions (..., K), equation (4)."""
     divergence = np.einsum("...k,...k->...", p, np.log(p) - np.log(q))
-    return np.maximum(divergence, 0.0)  # rounding can make it -1e-17
+    return np.maximum(divergence, 0.0)  # rounding can give -1e-17
 
 
 class KLDivergence(Divergence):
@@ -55,11 +55,11 @@ class KLDivergence(Divergence):
 
 
 class WindowedKLDivergence(KLDivergence):
-    """Histograms per window of a ``config.windows`` grid, divergences averaged over windows.
+    """KL divergence averaged over the windows of a ``config.windows`` grid.
 
-    "Introducing spatial windowing across the image for histogram generation" (Saeedi et al.,
-    ICRA 2017, section VII): two images with equal histograms but moved content then differ. The
-    counter splits the image, and the mean over windows is that of the base class.
+    "Introducing spatial windowing across the image for histogram generation" (Saeedi et al., ICRA
+    2017, section VII): images with equal histograms but moved content then differ. The counter
+    splits the image; the base class averages over windows.
     """
 
 
@@ -72,12 +72,11 @@ def earth_movers_1d(p: Float64, q: Float64) -> Float64:
 
 
 class SphereTransport:
-    """Transport between distributions over fixed directions; the ground distance is the angle.
+    """Optimal transport between distributions over fixed directions, with the angle as distance.
 
-    A linear programme, solved exactly by HiGHS' dual simplex. What two distributions have in common
-    stays where it is, because the angle is a metric, so that only the bins in which one has more
-    than the other are sources, and the rest sinks: at most L^2 / 4 variables. 2 ms a pair with 22
-    bins, 7 ms with 86, on one core.
+    A linear program, solved exactly by HiGHS' dual simplex. Since the angle is a metric, the common
+    part of two distributions does not move: bins with a surplus are sources, the others sinks, at
+    most L^2 / 4 variables. It takes 2 ms per pair with 22 bins and 7 ms with 86, on one core.
     """
 
     def __init__(self, directions: Float64) -> None:
@@ -89,7 +88,7 @@ class SphereTransport:
         return np.array([self._cost(row) for row in np.atleast_2d(p - q)])
 
     def _cost(self, difference: Float64) -> float:
-        """Least sum of mass times angle that levels a difference (L,) of distributions."""
+        """Least sum of mass times angle that balances a difference (L,) of distributions."""
         sources, sinks = np.flatnonzero(difference > 0), np.flatnonzero(difference < 0)
         if not (len(sources) and len(sinks)):
             return 0.0
@@ -98,7 +97,7 @@ class SphereTransport:
         rows = np.concatenate([arc // n, m + arc % n])
         moved = coo_array((np.ones(2 * m * n), (rows, np.concatenate([arc, arc]))))
         given, taken = difference[sources], -difference[sinks]
-        masses = np.concatenate([given, taken * (given.sum() / taken.sum())])  # but for rounding
+        masses = np.concatenate([given, taken * (given.sum() / taken.sum())])  # rounding
         costs = self.angles[np.ix_(sources, sinks)].ravel()
         # One equation follows from the others.
         found = linprog(costs, A_eq=moved.tocsr()[:-1], b_eq=masses[:-1], method="highs-ds")
@@ -108,14 +107,14 @@ class SphereTransport:
 
 
 class EarthMoversDivergence(Divergence):
-    """Tolerates small changes of light, which move grey levels to neighbouring bins.
+    """Earth mover's distance; tolerates small light changes, which move grey levels by few bins.
 
     "Using the Earth mover's distance to provide tolerance to small illumination changes"
     (Saeedi et al., ICRA 2017, section VII). Intensity: share of the grey range; normals: radians.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Prepare as every divergence, plus the ground distance between the bins."""
+        """Also prepare the ground distance between the bins."""
         super().__init__(*args, **kwargs)
         self._transport = SphereTransport(bin_directions(self.config.inclinations))
 

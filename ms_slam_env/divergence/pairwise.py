@@ -28,18 +28,17 @@ def intensity_divergence(
 ) -> float:
     """Intensity divergence KL(I_t || I_t-1) in nats, equation (5); the paper's setting by default.
 
-    As printed, (5) sums u = 0 to P, one term more than P = 256 grey levels have; it is read as
-    u = 0 to P - 1.
+    As printed, (5) sums from u = 0 to P, one term more than the P = 256 grey levels; here u < P.
 
     Args:
         current: I_t, an image (H, W) or (H, W, 3) uint8, or a frame.
-        previous: I_t-1, likewise; its size may differ, only distributions are compared.
+        previous: I_t-1, likewise; its size may differ, since only distributions are compared.
         bins: P, number of equal bins of the 256 grey levels.
         pseudo_count: pixels added to every bin before normalising.
         smoothing: standard deviation of the Parzen window, grey levels; 0 = none.
 
     Raises:
-        InputError: another shape or type of image, an empty image, an option out of range.
+        InputError: a wrong shape or type of image, an empty image, an option out of range.
     """
     config = DivergenceConfig(bins=bins, pseudo_count=pseudo_count, smoothing=smoothing)
     p, q = (_intensity_distribution(image, config) for image in (current, previous))
@@ -59,13 +58,13 @@ def depth_divergence(
 ) -> float:
     """Depth divergence KL(D_t || D_t-1) in nats, equations (6) to (10).
 
-    Pixels without a reading have no normal and are left out. An image in which no pixel has a
-    normal has the uniform distribution; two such images have divergence 0.
+    Pixels without a reading have no normal and are left out. An image without any normal has the
+    uniform distribution; two such images have divergence 0.
 
     Args:
         current: D_t, depth (H, W) in metres, 0 = no reading, or a frame.
         previous: D_t-1, likewise.
-        intrinsics: of both images.
+        intrinsics: intrinsics of both images.
         inclinations: N of equation (6).
         alpha_deg: influence angle alpha of equation (8), degrees.
         pseudo_count: normals added to every bin before normalising.
@@ -73,7 +72,7 @@ def depth_divergence(
         edge_threshold: see ``DivergenceConfig``.
 
     Raises:
-        InputError: NaN or negative depth, a size other than the intrinsics', an option out of
+        InputError: NaN or negative depth, a size that differs from the intrinsics, an option out of
             range.
     """
     config = DivergenceConfig(
@@ -93,7 +92,7 @@ def ms_parameters(divergences: ArrayLike) -> tuple[float, float]:
     """Motion-and-structure parameters (M_I, M_D) of divergences (T, 2), equations (11), (12).
 
     Raises:
-        InputError: another shape, no rows, or values that are not finite and >= 0.
+        InputError: a wrong shape, no rows, or values that are not finite and >= 0.
     """
     values = as_numbers(divergences, "divergences")
     if values.ndim != 2 or values.shape[1] != 2 or len(values) == 0:
@@ -127,7 +126,7 @@ def _depth_image(image: ArrayLike | RGBDFrame, intrinsics: Intrinsics) -> NDArra
     check_camera(intrinsics)
     try:
         depth = np.asarray(image.depth if isinstance(image, RGBDFrame) else image)
-    except ValueError:  # rows of several lengths
+    except ValueError:  # rows of different lengths
         raise InputError("depth must be an array") from None
     if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
         raise InputError(f"depth must be (H, W) float metres, got {depth.shape} {depth.dtype}")

@@ -10,23 +10,23 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._runtime.arrays import Float64
 
 MAP_SIZE = 32
-"""Cells along one side of the octahedral map of directions; even, so that no fold cuts a cell."""
-_ROUNDING_RAD = 1e-3  # more than single precision moves a direction across an edge of a cell
+"""Cells per side of the octahedral map of directions; even, so that no fold cuts a cell."""
+_ROUNDING_RAD = 1e-3  # upper bound of single-precision errors at cell edges
 
 
 @lru_cache(maxsize=32)
 def bin_directions(inclinations: int) -> Float64:
     """Centres (L, 3) of the bins as unit vectors, equations (6) and (7).
 
-    As printed, i runs from 1 to N: the pole at theta = pi has a bin, the one at theta = 0 has
-    none. In the camera frame (z forward) visible surfaces have normals with z < 0, near the
-    pole that has its bin.
+    As printed, i runs from 1 to N: the pole at theta = pi has a bin, but the one at theta = 0 does
+    not. In the camera frame (z forward) visible surfaces have normals with z < 0, near the pole
+    with a bin.
     """
     N = inclinations
     directions = []
     for i in range(1, N + 1):
         theta = np.pi * i / N  # (6)
-        # The small number keeps floor() right where 2 N sin(theta) is an integer.
+        # The small number keeps floor() correct if 2 N sin(theta) is an integer.
         M = int(np.floor(2 * N * np.sin(theta) + 1e-9)) + 1
         for j in range(1, M + 1):
             phi = 2 * np.pi * j / M  # (7)
@@ -55,17 +55,16 @@ def octahedral_directions(x: ArrayLike, y: ArrayLike) -> Float64:
     """
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     z = np.abs(x) + np.abs(y) - 1
-    fold = np.maximum(z, 0)  # the outer four triangles of the square are the folded half z > 0
+    fold = np.maximum(z, 0)  # the four outer triangles of the square are the folded half z > 0
     directions = np.stack([x - np.sign(x) * fold, y - np.sign(y) * fold, z], axis=-1)
     return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
 
 @lru_cache(maxsize=16)
 def bins_near(inclinations: int, alpha_deg: float) -> NDArray[np.int32]:
-    """Bins (MAP_SIZE ** 2, 1 + K) in which a direction in a cell of the octahedral map has weight.
+    """Bins (MAP_SIZE ** 2, 1 + K) that a direction in each cell of the octahedral map may affect.
 
-    Of each cell first how many, then which. The lists only save looking at bins whose weight (8)
-    is zero anyway.
+    Per cell: their number, then their indices. The lists only skip bins whose weight (8) is zero.
     """
     edges = np.linspace(-1, 1, MAP_SIZE + 1)
     corners = octahedral_directions(*np.meshgrid(edges, edges))

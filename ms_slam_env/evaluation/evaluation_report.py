@@ -1,4 +1,4 @@
-"""``ms-slam evaluate``: trajectories and maps compared, as text, JSON, tables and figures."""
+"""``ms-slam evaluate``: compare trajectories and maps; write text, JSON, tables and figures."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _ROBUSTNESS = (
 )
 _PRINTED = ("ate_printed_m", "rpe_printed_m", "rpe_printed_median_m")
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
-_SHOWN_M = 0.1  # the farthest threshold of the curves of precision and recall
+_SHOWN_M = 0.1  # largest threshold in the curves of precision and recall
 _MAX_DOTS = 40_000
 
 
@@ -56,9 +56,9 @@ class Evaluation:
         found: metrics by key.
         config: the files and the options.
         summary: lines for a terminal.
-        tables: of the metrics.
-        charts: the same.
-        write: writes what else belongs into a folder.
+        tables: tables of the metrics.
+        charts: charts of the metrics.
+        write: writes further files into a folder.
         record: writes a Rerun recording to a file.
     """
 
@@ -79,8 +79,8 @@ def write_evaluation(
 ) -> None:
     """Write ``evaluation.json``, ``table.md``, figures and files of all parts into ``out``.
 
-    ``formats``, of `table_files.FORMATS`, are more files of the tables; ``rerun`` asks for a
-    recording.
+    ``formats`` (see `table_files.FORMATS`) adds the tables in other file formats; ``rerun`` adds a
+    Rerun recording.
     """
 
     def write_more(folder: Path) -> None:
@@ -118,7 +118,7 @@ def evaluate_trajectories(estimate: Path, truth: Path, options: TrajectoryOption
 
     def write(out: Path) -> None:
         for name, poses in (("estimate", matched.estimate), ("truth", matched.truth)):
-            # A name of its own: the folder may be that of the files that are compared.
+            # A distinct name, since ``out`` may be the folder of the compared files.
             write_trajectory(out / f"evaluation.{name}.txt", matched.times, poses)
 
     return Evaluation(
@@ -153,7 +153,7 @@ def trajectory_summary(found: Found, options: TrajectoryOptions) -> str:
 
 
 def trajectory_tables(found: Found, options: TrajectoryOptions) -> list[Table]:
-    """Everything that was measured."""
+    """Tables of all measures."""
     errors = _errors(options)
     note = (
         f"{_matched(found)}, over {found['duration_s']:.3f} s and "
@@ -182,8 +182,8 @@ def trajectory_tables(found: Found, options: TrajectoryOptions) -> list[Table]:
         keys: list[Column | str] = ["length_m", "sub_trajectories", *drifts]
         tables.append(make_table(keys, found["drift_by_length"], title))
     printed = (absolute_key(options, "m"), "ate_printed_m", "rpe_m", *_PRINTED[1:])
-    note = "USME's equations (2) and (5) to the letter beside ours; they depend on the origin."
-    tables.append(_one_line(printed, found, "As USME prints it", note))
+    note = "As Zhang and Scaramuzza define them, beside ours; they depend on the origin."
+    tables.append(_one_line(printed, found, "USME equations 2 and 5", note))
     shown = [key for key in _ROBUSTNESS if found.get(key) is not None]
     note = f"{_gaps(found)}."
     if found.get("robustness_reason"):
@@ -213,7 +213,7 @@ def trajectory_charts(matched: Matched, options: TrajectoryOptions) -> list[Char
 
 
 def _matched(found: Found) -> str:
-    """Of how many poses the errors are."""
+    """Number of poses behind the errors, in words."""
     return f"{found['poses']} of {found['poses'] + found['unmatched_poses']} poses have a true one"
 
 
@@ -228,7 +228,7 @@ def _alignment(options: TrajectoryOptions) -> str:
 
 
 def _of_tracked(found: Found, options: TrajectoryOptions) -> str:
-    """What is known of the frames that were tracked."""
+    """Share and error of the tracked frames, in words."""
     share = f"{found['tracked_share']:.1%} of the poses"
     if options.frames is not None:
         return f"of tracked frames alone: {share}"
@@ -237,7 +237,7 @@ def _of_tracked(found: Found, options: TrajectoryOptions) -> str:
 
 
 def _broken(line: Float64, piece: NDArray[np.int64]) -> Float64:
-    """The points (N, k) of a line with NaN between pieces, so that no stroke joins them."""
+    """Points (N, k) of a line, with NaN between pieces so that they are not connected."""
     return np.insert(line, np.flatnonzero(np.diff(piece)) + 1, np.nan, axis=0)
 
 
@@ -273,7 +273,7 @@ def map_summary(found: Found, options: MapOptions) -> str:
 
 
 def map_tables(found: Found, options: MapOptions) -> list[Table]:
-    """Shares by threshold, then all distances."""
+    """Tables of shares by threshold, then of all distances."""
     shares = share_keys(options.thresholds_m)
     others = [key for key in _map_keys(options) if key not in shares]
     return [
@@ -283,7 +283,7 @@ def map_tables(found: Found, options: MapOptions) -> list[Table]:
 
 
 def map_heading(found: Found, options: MapOptions) -> str:
-    """What was compared."""
+    """Heading that says what was compared."""
     removed = ", outliers removed" if options.remove_outliers else ""
     return (
         f"{found['compared_points']} map points ({found['map_kind']}) against "
@@ -293,7 +293,7 @@ def map_heading(found: Found, options: MapOptions) -> str:
 
 
 def map_charts(compared: ComparedMap) -> list[Chart]:
-    """Shares of points within a distance."""
+    """Chart of the shares of points within a distance."""
     limits = np.linspace(0, _SHOWN_M, 101)
     series = [
         Series(name, limits.tolist(), _shares(distances, limits).tolist(), mode="lines")
@@ -305,12 +305,12 @@ def map_charts(compared: ComparedMap) -> list[Chart]:
 
 
 def save_map_picture(compared: ComparedMap, path: Path) -> Path:
-    """Draw the map along the axis in which it extends least, coloured by its error."""
+    """Draw the map, seen along its shortest axis and coloured by its error."""
     figure = figures.new_figure(1, 4.6, 4.2)
     ax = figure.subplots()
     errors_cm = 100 * compared.to_surface
     picked = np.unique(np.linspace(0, len(errors_cm) - 1, _MAX_DOTS).astype(int))
-    order = picked[np.argsort(errors_cm[picked])]  # the worst lie on top, so that they are seen
+    order = picked[np.argsort(errors_cm[picked])]  # the largest errors are drawn on top
     a, b = widest_axes(compared.cloud)
     (unseen,) = {0, 1, 2} - {a, b}
     dots = ax.scatter(

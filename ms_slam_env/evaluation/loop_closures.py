@@ -1,7 +1,8 @@
-"""How right closed loops are, and how many of those that the truth has.
+"""Precision and recall of loop closures.
 
-A loop is right if the pose that it states, of the camera beside an old frame, is within a tolerance
-of the true one. What there was to close: frames that see a view again after having left it.
+A loop is right if the pose that it reports, of the camera relative to an old frame, is within a
+tolerance of the true one. Loops that should be found are frames that see a view again after having
+left it.
 """
 
 from __future__ import annotations
@@ -17,16 +18,16 @@ from ms_slam_env.evaluation.seen_surface import back_projected
 from ms_slam_env.geometry import invert, relative_angle
 from ms_slam_env.slam.slam_backend import Loop
 
-WRONG_DEG = 3.0  # a loop is wrong if it is off by more
+WRONG_DEG = 3.0  # a loop with a larger rotation error is wrong
 
 SEEN_AGAIN, OUT_OF_SIGHT = 0.5, 0.1
-"""Share of a view's readings that a frame shows: at least this, and at most this."""
+"""Shares of a view's readings: least to count as seen again, most to count as out of sight."""
 AWAY_S, BREAK_S = 3.0, 1.0
-"""Seconds that a view must have been out of sight; of a break that does not end a revisit."""
-_EVERY = 5  # of the frames one is taken for a view that may be seen again
-_GRID = 8  # every so many rows and columns of it
+"""Least time in seconds that a view must be out of sight; longest break within one revisit."""
+_EVERY = 5  # one in this many frames is a view that may be seen again
+_GRID = 8  # stride in rows and columns of the readings of a view
 _FEWEST = 20  # readings of a view
-_DEPTH_SHARE = 0.05  # difference of depth at which a point is shown
+_DEPTH_SHARE = 0.05  # largest relative difference of depth at which a point counts as shown
 
 
 def pose_error(a: Float64, b: Float64) -> tuple[float, float]:
@@ -42,18 +43,18 @@ def find_revisits(
     times: Float64,
     reach_m: float,
 ) -> Int32:
-    """Which revisit each of N frames is part of; -1: of none.
+    """Number of the revisit that each of N frames belongs to; -1 for none.
 
-    A frame revisits an old view if it shows at least half of what that saw: its true readings, seen
-    at their depth. Between the two lie three seconds in which less than a tenth of it was shown.
-    One revisit is a run of such frames, with breaks of up to a second.
+    A frame revisits an old view if it shows at least half of that view's true readings at their
+    depth, after three seconds or more in which less than a tenth of them was visible. One revisit
+    is a run of such frames, with breaks of up to a second.
 
     Args:
-        depths: (N, h, w) true depth of the still world, metres; 0 where there is none.
+        depths: (N, h, w) true depth of the static scene, metres; 0 where there is none.
         intrinsics: of these images.
         poses: (N, 4, 4) true T_world_camera.
         times: (N,) seconds.
-        reach_m: readings beyond are left out.
+        reach_m: ignore readings beyond this depth.
     """
     found: Bool = np.zeros(len(poses), dtype=bool)
     coarse = intrinsics.every_nth(_GRID)
@@ -71,7 +72,7 @@ def _shown(
     """Share of points (M, 3) that each of N frames shows."""
     T = invert(poses)
     seen = np.einsum("nij,mj->nmi", T[:, :3, :3], points) + T[:, None, :3, 3]
-    z = seen[..., 2] = np.maximum(seen[..., 2], 1e-3)  # what is behind falls out of the image
+    z = seen[..., 2] = np.maximum(seen[..., 2], 1e-3)  # those behind project outside
     pixels = np.rint(intrinsics.project(seen))
     inside: Bool = np.all((pixels >= 0) & (pixels < (intrinsics.width, intrinsics.height)), axis=-1)
     column, row = np.moveaxis(np.where(inside[..., None], pixels, 0).astype(np.int64), -1, 0)
@@ -81,7 +82,7 @@ def _shown(
 
 
 def _back(shares: Float64, times: Float64) -> Bool:
-    """Frames (N,) that show a view again, of which they show ``shares`` (N,), after it was away."""
+    """Frames (N,) that see a view again after losing it; they show ``shares`` (N,) of it."""
     away = shares <= OUT_OF_SIGHT
     last_here = np.maximum.accumulate(np.where(away, 0, np.arange(len(shares))))
     left = away & (times - times[last_here] >= AWAY_S)
@@ -90,7 +91,7 @@ def _back(shares: Float64, times: Float64) -> Bool:
 
 
 def _runs(found: Bool, times: Float64) -> Int32:
-    """Number (N,) of the run that each of the ``found`` (N,) is in; -1: in none."""
+    """Number (N,) of the run that each of the ``found`` (N,) frames is in; -1 for none."""
     numbers = np.full(len(found), -1, dtype=np.int32)
     frames = np.flatnonzero(found)
     numbers[frames] = np.cumsum(np.diff(times[frames], prepend=times[frames[:1]]) > BREAK_S)
@@ -102,16 +103,16 @@ def loop_measures(
 ) -> dict[str, float | int | None]:
     """Precision and recall of loops by frame.
 
-    ``loop_precision`` is the share of the loops that are right: the pose that each states is within
-    ``tolerance_m`` and 3 degrees of the true one. ``loop_recall`` is the share of the frames of
-    revisits at which a right one has been stated, then or earlier in the same revisit. None where
-    there is nothing to divide by.
+    ``loop_precision`` is the share of the loops that are right: the reported pose is within
+    ``tolerance_m`` and 3 degrees of the true one. ``loop_recall`` is the share of the revisiting
+    frames at which a right loop has been reported, at that frame or earlier in the same revisit.
+    Each is None if there is no loop or no revisiting frame.
 
     Args:
-        loops: what was stated, by frame.
+        loops: reported loops, by frame.
         truth: (N, 4, 4) true T_world_camera.
-        revisits: (N,) of ``find_revisits``.
-        tolerance_m: largest error of a right loop, metres.
+        revisits: (N,) from ``find_revisits``.
+        tolerance_m: largest position error of a right loop, metres.
     """
     right = [frame for frame, loop in loops.items() if _is_right(frame, loop, truth, tolerance_m)]
     recalled = 0

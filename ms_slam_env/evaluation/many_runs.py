@@ -1,4 +1,4 @@
-"""Many trajectory files against one truth: systems with intervals, boxes over the deltas."""
+"""Compare many trajectory files with one truth: medians by system, box plots by delta."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class Run:
     """One run of a system.
 
     Attributes:
-        system: whose it is; runs of one system stand together.
-        path: of the TUM file.
-        matched: with the truth.
+        system: name of the system; results of runs with the same name are pooled.
+        path: the TUM file.
+        matched: its poses matched with the truth.
         found: its measures.
-        relative: errors (K,) in metres of the motions over each delta, by delta.
+        relative: relative translation errors (K,) in metres, by delta.
     """
 
     system: str
@@ -49,7 +49,7 @@ class Run:
 
 
 def parse_run(text: str) -> tuple[str, Path]:
-    """System and file of ``NAME=FILE``, or of a file whose name is the system's.
+    """Split ``NAME=FILE`` into system and file; without NAME the file name is the system's.
 
     Raises:
         InputError: an empty name or file.
@@ -65,16 +65,16 @@ def parse_run(text: str) -> tuple[str, Path]:
 def evaluate_runs(
     texts: Sequence[str], truth: Path, options: TrajectoryOptions, deltas: Sequence[float] = ()
 ) -> Evaluation:
-    """Compare runs with one truth; each with all measures, relative errors over every delta.
+    """Compare runs with one truth by all measures, with relative errors over every delta.
 
     Args:
-        texts: ``NAME=FILE`` each; runs of one name are runs of one system.
+        texts: ``NAME=FILE`` each; runs with the same name belong to one system.
         truth: TUM file.
-        options: as of one trajectory; their unit is that of the deltas.
-        deltas: that relative errors are given over; that of the options if none.
+        options: as for one trajectory; ``delta_unit`` is the unit of ``deltas``.
+        deltas: distances of the relative errors; that of the options if empty.
 
     Raises:
-        InputError: as `match_files` and `measure_matched`, a file that is given twice, or no run.
+        InputError: as `match_files` and `measure_matched`, a file given twice, or no run.
     """
     if not texts:
         raise InputError("no run given")
@@ -104,7 +104,7 @@ def evaluate_runs(
 
 
 def labelled(runs: Sequence[Run]) -> dict[str, Matched]:
-    """Matched poses by a name of each run: that of its system, numbered where it has several."""
+    """Matched poses by run name: that of its system, numbered if the system has several runs."""
     systems = [run.system for run in runs]
     numbers = {name: itertools.count(1) for name in systems}
     found = {}
@@ -149,14 +149,14 @@ def boxes_table(runs: Sequence[Run], options: TrajectoryOptions) -> Table:
 
 
 def runs_table(runs: Sequence[Run], options: TrajectoryOptions) -> Table:
-    """Every run."""
+    """Table of all runs."""
     keys = ("poses", "unmatched_poses", *_keys(options))
     lines = [{"system": run.system, "estimate_file": run.path.name, **run.found} for run in runs]
     return make_table(("system", "estimate_file", *keys), lines, "Runs")
 
 
 def pooled(runs: Sequence[Run]) -> dict[tuple[str, float], Float64]:
-    """Relative errors (K,) by system and delta, of all of its runs."""
+    """Relative errors (K,) of all runs of a system, by system and delta."""
     together: dict[tuple[str, float], list[Float64]] = {}
     for run in runs:
         for delta, errors in run.relative.items():

@@ -1,7 +1,7 @@
-"""Two map files compared: a reconstruction against the true surface.
+"""Compare two map files: a reconstruction and the true surface.
 
-Clouds are taken as they are, meshes are sampled, the depth of a sequence is placed by its true
-poses.
+Clouds are used unchanged, meshes are sampled, and the depth images of a sequence are placed by its
+true poses.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ class MapOptions(Checked):
     """How two maps are compared.
 
     Attributes:
-        register: how the map is first brought onto the truth: ``none``, ``icp``, ``plane-icp`` or
+        register: how to register the map to the truth first: ``none``, ``icp``, ``plane-icp`` or
             ``gicp``.
-        cutoff_m: pairs of points farther apart do not count in that.
-        remove_outliers: statistically, before everything else, as USME does.
-        neighbours: of a point in the statistics of outliers.
-        std_ratio: standard deviations from the mean that make an outlier.
-        two_sided: points whose neighbours are nearer than that below the mean are outliers, too.
-        thresholds_m: for precision, recall and F-score.
-        voxel_m: both clouds keep one point a voxel of this side, so that a surface counts by its
-            area; 0 keeps all.
-        samples: points taken from a mesh.
-        seed: of that choice.
+        cutoff_m: ignore pairs of points farther apart than this in the registration.
+        remove_outliers: remove statistical outliers before everything else, as USME does.
+        neighbours: number of neighbours for the outlier statistics.
+        std_ratio: standard deviations from the mean beyond which a point is an outlier.
+        two_sided: whether points whose neighbours are unusually close are outliers, too.
+        thresholds_m: thresholds of precision, recall and F-score.
+        voxel_m: keep one point per voxel of this side in both clouds, so that each surface counts
+            by its area; 0 keeps all.
+        samples: number of points sampled from a mesh.
+        seed: seed of the sampling.
     """
 
     register: str = chosen("none", *REGISTRATIONS)
@@ -64,7 +64,7 @@ class MapOptions(Checked):
     seed: int = bounded(0, 0, 2**32 - 1)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse invalid options."""
         super().__post_init__()
         if len(self.thresholds_m) == 0:
             raise InputError("MapOptions.thresholds_m is empty")
@@ -79,11 +79,11 @@ def evaluate_maps(
     """Compare the map in file ``estimate`` with the true surface in file ``truth``.
 
     Returns:
-        The measures by keys of the registry, and the clouds that they are of.
-        ``rer_m`` is taken after point-to-point ICP if nothing else was asked for.
+        The measures by registry key, and the compared clouds. ``rer_m`` is computed after
+        point-to-point ICP unless another registration was chosen.
 
     Raises:
-        InputError: a file that cannot be read, too few points for the statistics of outliers.
+        InputError: a file that cannot be read, too few points for the outlier statistics.
     """
     options = options or MapOptions()
     read = read_surface(estimate, options.samples, options.seed)
@@ -122,7 +122,7 @@ def _thin(points: Float64, voxel_m: float) -> Float64:
 
 @dataclass(frozen=True)
 class SurfaceFile:
-    """What a file holds.
+    """Surface points read from a file.
 
     Attributes:
         points: (N, 3) metres.
@@ -134,15 +134,15 @@ class SurfaceFile:
 
 
 def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
-    """Read a cloud or a mesh.
+    """Read a cloud, a mesh, or the surface seen by a sequence.
 
     Args:
-        path: of the file, in a format of scenes and with their options (see ``MeshOptions``); or of
-            a sequence's folder, for the surface that its depth images show
-            from its true poses, up to 5 m away. Those of ``depth_true`` are taken if
-            ``ms-slam generate --truth`` wrote them, else the recorded ones with their noise.
-        samples: points taken evenly from the surface of a mesh.
-        seed: of that choice.
+        path: file in one of the scene formats, with their options (see ``MeshOptions``); or folder
+            of a sequence, for the surface that its depth images show from the true poses, up to
+            5 m away. Images in ``depth_true`` are used if ``ms-slam generate --truth`` wrote them,
+            otherwise the recorded ones with their noise.
+        samples: number of points sampled evenly from the surface of a mesh.
+        seed: seed of the sampling.
 
     Raises:
         InputError: no such file, one that cannot be read, no points in it, or points that are not
@@ -180,7 +180,7 @@ def read_surface(path: Path, samples: int, seed: int = 0) -> SurfaceFile:
 
 
 def _sequence_surface(recording: Recording, true_depth: Path) -> SurfaceFile:
-    """What the frames of a sequence with a true trajectory saw."""
+    """Surface that the frames of a sequence with a true trajectory saw."""
     if recording.truth is None or recording.truth_times is None:
         raise InputError(f"sequence {recording.name} has no true trajectory to place its depth by")
     kind = "recorded depth"

@@ -1,6 +1,6 @@
-"""How good a map is: its points against the true surface.
+"""Quality of a map: its points compared with the true surface.
 
-Every measure of a map goes through `map_quality`, which searches only for what is asked::
+Every measure of a map goes through `map_quality`, which computes only what is requested::
 
     map_quality(slam.surface_points(), surface)                            # the planners' measures
     map_quality(slam.surface_points(), surface, ("map_error_median_m",))   # one search, no ICP
@@ -29,8 +29,8 @@ from ms_slam_env.metrics.reconstruction import (
 )
 
 THRESHOLDS_M = (0.02, 0.05)
-MAP_VOXEL_M = 0.01  # a surface counts by its area, not by how often it was seen
-CAP_M = 0.1  # of one distance in the capped RMS, by which a few strays do not decide
+MAP_VOXEL_M = 0.01  # so that a surface counts by its area, not by how often it was seen
+CAP_M = 0.1  # largest distance in the capped RMS, so that a few outliers do not dominate it
 
 _SHARE = re.compile(r"(precision|recall|f_score)_(\d+(?:\.\d+)?)cm")
 
@@ -50,21 +50,21 @@ def share_keys(
 
 
 STANDARD = (*share_keys(THRESHOLDS_M), "rcm", "rer_m", "map_points")
-"""What planners are judged by."""
+"""Measures used to compare planners."""
 
 
 class ComparedMap:
-    """A map beside the true surface; distances are searched for when they are first asked for.
+    """A map and the true surface; distances are computed on first use.
 
-    The map is judged where its estimated poses placed it; only RER registers it first.
+    The map is evaluated where its estimated poses placed it; only RER registers it first.
 
     Args:
-        points: (N, 3) of the map, metres; none is a map that has nothing.
-        surface: (M, 3) of the true surface.
-        reference: (K, 3) true points that the map should have; ``surface`` by default.
-        voxel_m: the map keeps one point a voxel of this side; 0 keeps all.
-        registered: whether the map has been registered to the surface already; RER is then taken
-            where it lies.
+        points: (N, 3) map points, metres; N = 0 is an empty map.
+        surface: (M, 3) points of the true surface.
+        reference: (K, 3) true points that the map should cover; ``surface`` by default.
+        voxel_m: keep one map point per voxel of this side; 0 keeps all.
+        registered: whether the map is already registered to the surface; RER is then computed
+            without another registration.
     """
 
     def __init__(
@@ -84,23 +84,23 @@ class ComparedMap:
 
     @cached_property
     def to_surface(self) -> Float64:
-        """(N,) distance of each map point to the true surface; of an empty map one NaN."""
+        """(N,) distance of each map point to the true surface; one NaN for an empty map."""
         return self._search(self.cloud, self.surface)
 
     @cached_property
     def to_map(self) -> Float64:
-        """(K,) distance of each point of the reference to the map; of an empty map one NaN."""
+        """(K,) distance of each reference point to the map; one NaN for an empty map."""
         return self._search(self.reference, self.cloud)
 
     def _search(self, points: ArrayLike, target: ArrayLike | IndexedCloud) -> Float64:
         return nearest_distances(points, target) if self.map_points else np.array([np.nan])
 
     def precision(self, threshold_m: float) -> float:
-        """Share of map points nearer to the true surface; 0 of an empty map."""
+        """Share of map points closer than this to the true surface; 0 for an empty map."""
         return float((self.to_surface < threshold_m).mean())
 
     def recall(self, threshold_m: float) -> float:
-        """Share of the reference nearer to the map; 0 of an empty map."""
+        """Share of the reference closer than this to the map; 0 for an empty map."""
         return float((self.to_map < threshold_m).mean())
 
     def f_score(self, threshold_m: float) -> float:
@@ -108,13 +108,13 @@ class ComparedMap:
         return harmonic_mean(self.precision(threshold_m), self.recall(threshold_m))
 
     def rer(self) -> float:
-        """RMS distance of map points to the true surface, after ICP; NaN of an empty map."""
+        """RMS distance of map points to the true surface, after ICP; NaN for an empty map."""
         if not self.map_points:
             return float("nan")
         return _rms(self.to_surface) if self.registered else rer(self.cloud, self.surface)
 
     def measure(self, keys: Iterable[str] = STANDARD) -> dict[str, float]:
-        """The measures of the given keys, lengths in metres; distances NaN of an empty map.
+        """Measures by key, lengths in metres; distances of an empty map are NaN.
 
         Raises:
             InputError: an unknown key.
@@ -156,18 +156,18 @@ def map_quality(
     reference: ArrayLike | None = None,
     voxel_m: float = MAP_VOXEL_M,
 ) -> dict[str, float]:
-    """Judge ``points`` (N, 3) of a map against points (M, 3) of the true surface, metres.
+    """Compare the points (N, 3) of a map with points (M, 3) of the true surface, metres.
 
     Args:
-        points: of the map, where its estimated poses placed it.
-        surface: that map points should lie on.
-        keys: of the registry: ``precision_2cm``, ``recall_5cm``, ``f_score_10cm`` and so on,
+        points: map points, where the estimated poses placed them.
+        surface: true surface, on which map points should lie.
+        keys: registry keys: ``precision_2cm``, ``recall_5cm``, ``f_score_10cm`` and so on,
             ``rcm``, ``rer_m``, ``map_error_median_m``, ``map_error_capped_rms_m``, ...
-        reference: (K, 3) true points that the map should have; ``surface`` by default.
-        voxel_m: the map keeps one point a voxel of this side; 0 keeps all.
+        reference: (K, 3) true points that the map should cover; ``surface`` by default.
+        voxel_m: keep one map point per voxel of this side; 0 keeps all.
 
     Returns:
-        the measures by key, in the order of ``keys``; of an empty map shares are 0 and distances
+        the measures by key, in the order of ``keys``; for an empty map, shares are 0 and distances
         NaN.
 
     Raises:
@@ -180,22 +180,22 @@ def _rms(distances: Float64) -> float:
     return float(np.sqrt(np.mean(distances**2)))
 
 
-SURFACE_SPACING_M = 0.02  # of true surface that stands in for the exact distance
+SURFACE_SPACING_M = 0.02  # of the points that approximate the true surface
 _MAP_VOXEL_M = 0.02
-_SAMPLES = 5000  # of the map and of the reference: +-1 percentage point
+_SAMPLES = 5000  # points of map and of reference, for an accuracy of +-1 percentage point
 
 
 class ScoreCurve:
-    """F-score of a map after each of some steps.
+    """F-score of a map over the steps of an episode.
 
     Args:
-        surface: (M, 3) true surface, about ``SURFACE_SPACING_M`` apart.
-        reference: (K, 3) true points that the map should have.
-        threshold_m: within which a point is right.
+        surface: (M, 3) true surface points, about ``SURFACE_SPACING_M`` apart.
+        reference: (K, 3) true points that the map should cover.
+        threshold_m: distance within which a point is correct.
 
     Attributes:
-        steps: (S) at which the map was looked at.
-        scores: (S) its F-score, by samples of map and reference.
+        steps: (S) steps at which the map was evaluated.
+        scores: (S) F-scores, from samples of map and reference.
     """
 
     def __init__(
@@ -211,12 +211,12 @@ class ScoreCurve:
         self.scores: list[float] = []
 
     def look(self, step: int, points: Float64) -> None:
-        """Judge the map's ``points`` (N, 3) after a step."""
+        """Evaluate the map's ``points`` (N, 3) after a step."""
         self.steps.append(step)
         self.scores.append(self._score(points))
 
     def area(self, steps: int) -> float:
-        """Mean F-score over ``steps``, linear between looks; after the last one the map stays."""
+        """Mean F-score over ``steps``: linear between evaluations, constant after the last one."""
         from scipy.integrate import trapezoid
 
         scores, at = [*self.scores, self.scores[-1]], [*self.steps, max(steps, self.steps[-1])]
@@ -235,7 +235,7 @@ class ScoreCurve:
 
 
 def _evenly(points: Float64) -> Float64:
-    """At most ``_SAMPLES`` of points (N, 3), drawn from a fixed seed."""
+    """At most ``_SAMPLES`` of points (N, 3), drawn with a fixed seed."""
     if len(points) <= _SAMPLES:
         return points
     return points[np.random.default_rng(0).choice(len(points), _SAMPLES, replace=False)]

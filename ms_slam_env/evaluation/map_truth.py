@@ -1,11 +1,11 @@
-"""The true surface that a map is judged against, the same for every planner of one episode.
+"""The true surface that a map is compared with, the same for every planner in one episode.
 
-Precision asks of each map point whether it lies on the true surface, anywhere in the scene.
-Recall and completeness ask how much of a *reference* was mapped. The reference must not depend on
-where a planner went: measured against what it has seen itself, a camera that stands still is
-complete. It is therefore what can be seen from places that the camera can come to: `nearby`, those
-on a straight way of at most ``REACH_M`` from the start; in the whole `scene`; or where an `arm` can
-bring it.
+Precision asks whether each map point lies on the true surface, anywhere in the scene. Recall and
+completeness ask how much of a *reference* was mapped. The reference must not depend on where a
+planner went: measured against what it saw itself, a camera that stands still would be complete. The
+reference is therefore the surface visible from places that the camera can reach: with `nearby`, on
+a straight line of at most ``REACH_M`` from the start; with `scene`, anywhere in the scene; with
+`arm`, where the arm can bring it.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from ms_slam_env.scenes.mesh_queries import RayCaster
 from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor.scene_cache import get_scene
 
-RADIUS_M = 3.0  # what a view reaches, in every direction; part of the protocol
+RADIUS_M = 3.0  # range of a view, in every direction; part of the protocol
 REACH_M = 1.0
 SURFACE_SPACING_M = 0.01  # half the smaller threshold of the F-score
 REFERENCE_SPACING_M = 0.03
 _VIEWPOINTS = 48
 _CAMERA_RADIUS_M = 0.1
 _OCCLUSION_SLACK = 0.01  # share of the distance by which a sample may lie behind the mesh
-_GRID_M = 0.2  # places of a camera in the whole scene; every third along each axis looks around
+_GRID_M = 0.2  # spacing of camera positions in the whole scene; every third per axis looks around
 _EVERY = 3
 
 
@@ -47,17 +47,17 @@ def true_surface(scene: str, scene_seed: int, spacing_m: float = SURFACE_SPACING
 def reference_surface(
     kind: str, scene: Scene, start: Float64, embodiment: Embodiment, intrinsics: Intrinsics
 ) -> Float64:
-    """Points (N, 3) of true surface that a map should have, by a task's kind of reference.
+    """Points (N, 3) of the true surface that a map should cover, by a task's kind of reference.
 
     Args:
         kind: ``nearby``, ``scene`` or ``arm``; see :class:`ms_slam_env.tasks.Task`.
-        scene: that is mapped.
-        start: (3,) where the camera starts.
-        embodiment: what carries the camera.
+        scene: scene to map.
+        start: (3,) start position of the camera.
+        embodiment: embodiment that moves the camera.
         intrinsics: of the camera.
 
     Raises:
-        InputError: kind ``arm`` where no arm carries it.
+        InputError: kind ``arm`` without an arm.
     """
     if kind == "nearby":
         return surface_nearby(scene, start)
@@ -69,9 +69,9 @@ def reference_surface(
 
 
 def surface_nearby(scene: Scene, start: Float64) -> Float64:
-    """Points (N, 3) of true surface that a camera starting at ``start`` (3,) could map nearby.
+    """Points (N, 3) of the true surface that a camera starting at ``start`` (3,) could map nearby.
 
-    Nothing farther than ``RADIUS_M`` from the start.
+    All lie within ``RADIUS_M`` of the start.
     """
     points = scene.surface_points(REFERENCE_SPACING_M)[0]
     points = points[np.linalg.norm(points - start, axis=1) <= RADIUS_M]
@@ -79,9 +79,9 @@ def surface_nearby(scene: Scene, start: Float64) -> Float64:
 
 
 def surface_of_scene(scene: Scene, start: Float64) -> Float64:
-    """Points (N, 3) of true surface that a camera starting at ``start`` (3,) could map at all.
+    """Points (N, 3) of the true surface that a camera starting at ``start`` (3,) could map at all.
 
-    Nothing farther than ``RADIUS_M`` from where it is seen.
+    Each lies within ``RADIUS_M`` of a position from which it is visible.
     """
     points = scene.surface_points(REFERENCE_SPACING_M)[0]
     eyes = connected_viewpoints(scene, start)
@@ -89,9 +89,9 @@ def surface_of_scene(scene: Scene, start: Float64) -> Float64:
 
 
 def surface_of_views(scene: Scene, poses: Float64, intrinsics: Intrinsics) -> Float64:
-    """Points (N, 3) of true surface that a camera could map from ``poses`` (K, 4, 4).
+    """Points (N, 3) of the true surface that a camera could map from ``poses`` (K, 4, 4).
 
-    Nothing farther than ``RADIUS_M`` from where it is seen.
+    Each lies within ``RADIUS_M`` of a pose from which it is visible.
     """
     points = scene.surface_points(REFERENCE_SPACING_M)[0]
     half = np.array([intrinsics.width, intrinsics.height]) / 2
@@ -115,9 +115,9 @@ def _is_near(points: Float64, eye: Float64) -> Bool:
 def _in_sight(
     scene: Scene, points: Float64, eyes: Float64, looked_at: Callable[[int, Float64], Bool | bool]
 ) -> Float64:
-    """Those of ``points`` (N, 3) that nothing hides from one of the ``eyes`` (K, 3).
+    """Those of ``points`` (N, 3) that are visible from at least one of the ``eyes`` (K, 3).
 
-    Eye number k looks at those that ``looked_at(k, points)`` says.
+    Eye k considers only the points selected by ``looked_at(k, points)``.
     """
     caster = RayCaster(scene.mesh.vertices, scene.mesh.faces)
     visible = np.zeros(len(points), dtype=bool)
@@ -125,14 +125,14 @@ def _in_sight(
         hidden = np.flatnonzero(~visible)
         hidden = hidden[np.broadcast_to(looked_at(k, points[hidden]), hidden.shape)]
         directions = points[hidden] - eye
-        # Distances come in units of the direction's length: 1 is the point itself.
+        # Distances are in units of the direction's length: 1 is the point itself.
         hit, _ = caster.first_hit(np.broadcast_to(eye, directions.shape), directions)
         visible[hidden[hit >= 1 - _OCCLUSION_SLACK]] = True
     return points[visible]
 
 
 def reachable_viewpoints(scene: Scene, start: Float64) -> Float64:
-    """(K, 3) camera positions spread over the free straight ways from ``start``, itself first."""
+    """(K, 3) camera positions along free straight lines from ``start``, which comes first."""
     rng = np.random.default_rng(0)  # fixed: the reference must not vary
     directions = rng.normal(size=(_VIEWPOINTS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -143,7 +143,7 @@ def reachable_viewpoints(scene: Scene, start: Float64) -> Float64:
 
 
 def connected_viewpoints(scene: Scene, start: Float64) -> Float64:
-    """(K, 3) camera positions all over the free space that ``start`` is in, itself first."""
+    """(K, 3) camera positions all over the free space around ``start``, which comes first."""
     low, high = scene.bounds()
     first = np.floor((start - low) / _GRID_M)
     low = start - _GRID_M * first  # the start is a point of the grid

@@ -1,18 +1,18 @@
-"""How far what a camera observes of the same surface moves from one frame to the next.
+"""Observation distance: how far the observed surface points move from one frame to the next.
 
 Saeedi, Carvalho, Li, Tzoumanikas, Leutenegger, Kelly, Davison, "Characterizing visual localization
-and mapping datasets", ICRA 2019, the successor of Table I of the ICRA 2017 paper, has as difficulty
-of a data set the mean or median over time of
+and mapping datasets", ICRA 2019, the successor of Table I of the ICRA 2017 paper, defines the
+difficulty of a data set as the mean or median over time of
 
     w(t) = W_2(P_t, P_t-1),   P_t = prod_k p(z_t,k | x_t, m_k)
 
-the 2-Wasserstein distance between the likelihoods of consecutive frames, which are Gaussian: their
-means come from the true poses and landmarks, their variances from the sensor's noise. We know the
-paper by its abstract and by summaries; what they leave open is ours. Landmarks are the points of
-the earlier frame's depth image (a grid) that the later one sees too, an observation is the point in
-the camera's frame, its noise that of a Kinect (Nguyen et al., 3DIMPVT 2012) along and across the
-optical axis. P factorises over the landmarks, so the squared distances add up; we take their mean,
-so that the number of landmarks does not count.
+the 2-Wasserstein distance between the likelihoods of consecutive frames. These are Gaussian: their
+means come from the true poses and landmarks, their variances from the sensor noise. We know only
+the paper's abstract and summaries, and chose the rest ourselves. Landmarks are the points of the
+earlier frame's depth image (a grid) that the later frame sees too. An observation is the point in
+the camera frame, with the noise of a Kinect (Nguyen et al., 3DIMPVT 2012) along and across the
+optical axis. P factorises over the landmarks, so the squared distances add up; we use their mean,
+so that the number of landmarks does not matter.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.geometry import invert, transform_points
 
 _ACROSS = 40  # landmarks in a row of the grid
-_HIDDEN = 0.05  # of the depth by which a landmark may lie behind what the later frame sees
+_HIDDEN = 0.05  # share of the depth by which a landmark may lie behind the later frame's surface
 _LATERAL_PX = 0.8  # standard deviation across the optical axis
 
 
 def observation_distance(
     before: RGBDFrame, after: RGBDFrame, T_before_after: Float64, K: Intrinsics
 ) -> float:
-    """w(t) in metres of one landmark; NaN where the frames see nothing in common.
+    """w(t) in metres per landmark; NaN if the frames see nothing in common.
 
     Args:
         before: frame t - 1.
@@ -49,13 +49,13 @@ def observation_distance(
     if not both.any():
         return float("nan")
     a, b = z_before[both], z_after[both]
-    # Of Gaussians whose axes are the same, W_2^2 = |mu_a - mu_b|^2 + |sigma_a - sigma_b|^2.
+    # For Gaussians with the same axes, W_2^2 = |mu_a - mu_b|^2 + |sigma_a - sigma_b|^2.
     moved, noisier = a - b, noise(a, K) - noise(b, K)
     return float(np.sqrt((moved**2 + noisier**2).sum(axis=1).mean()))
 
 
 def noise(points: Float64, K: Intrinsics) -> Float64:
-    """Standard deviations (N, 3) in metres of observed points (N, 3): across twice, along."""
+    """Standard deviations (N, 3) in metres of observed points (N, 3): across (twice) and along."""
     z = points[:, 2]
     across = _LATERAL_PX * z / K.fx
     along = 0.0012 + 0.0019 * np.maximum(z - 0.4, 0.0) ** 2
@@ -63,7 +63,7 @@ def noise(points: Float64, K: Intrinsics) -> Float64:
 
 
 def _are_seen(points: Float64, frame: RGBDFrame, K: Intrinsics) -> NDArray[np.bool_]:
-    """Which points (N, 3) in a camera's frame its image shows, not hidden by something nearer."""
+    """Whether points (N, 3) in the camera frame are in the image and not occluded, (N,)."""
     z = np.where(points[:, 2] > 0, points[:, 2], np.inf)
     u = np.round(K.fx * points[:, 0] / z + K.cx)
     v = np.round(K.fy * points[:, 1] / z + K.cy)

@@ -1,4 +1,4 @@
-"""Trajectories and their errors as a Rerun recording."""
+"""Write trajectories and their errors as a Rerun recording."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _TRUE_COLOUR = (120, 120, 120)
 
 
 def write_paths(path: Path, runs: Mapping[str, Matched]) -> Path:
-    """Write the aligned path of every run beside the truth, and its errors over time.
+    """Write the aligned path of every run, the true path, and the errors over time.
 
-    Entities, of each run by its name: ``world/NAME/path``, ``world/NAME/camera`` at the times of
-    its poses, ``error/NAME``, metres; and ``world/truth``. Times are those of the files, timeline
-    ``time``. `rerun FILE` shows it.
+    Entities: ``world/truth`` and, for each run, ``world/NAME/path``, ``world/NAME/camera`` at the
+    times of its poses, and ``error/NAME`` in metres. The timeline ``time`` has the times of the
+    files. View the file with `rerun FILE`.
 
     Raises:
         InputError: Rerun is not installed.
-        OSError: with the name of the file.
+        OSError: the file cannot be written; the message names it.
     """
     try:
         import rerun as rr

@@ -1,4 +1,4 @@
-"""The files of a run: what every frame cost and how it was aligned (CSV), and the map (PLY)."""
+"""The files of a run: cost and alignment of every frame (CSV), and the map (PLY)."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ms_slam_env.slam.slam_backend import SlamBackend
 from ms_slam_env.slam.volumetric.voxel_grid import load_open3d
 
 COSTS = ("frame_cpu_ms", "frame_ext_ms", "frame_mem_mb", "frame_ene_j")
-"""Metrics of one frame, as `frame_costs` gives them."""
+"""Metrics of one frame that `frame_costs` returns."""
 
 
 def frame_costs(run: SequenceRun) -> dict[str, Float64]:
-    """What each frame (N,) cost, by key; NaN where it cannot be had.
+    """Cost of each frame (N,), by key; NaN if it is not available.
 
-    The cost of a frame that was interrupted before it was recorded is left out.
+    Leaves out a frame that was interrupted before it was recorded.
     """
     costs = run.costs[: len(run)]
     values = [(1e3 * cost.cpu_s, 1e3 * cost.ext_s, cost.mem_mb, cost.joules) for cost in costs]
@@ -35,9 +35,9 @@ def frame_costs(run: SequenceRun) -> dict[str, Float64]:
 
 
 def write_frames(path: Path, run: SequenceRun) -> None:
-    """Write as CSV what every frame cost, how it was aligned, and why it was refused.
+    """Write the cost of every frame, its alignment, and why it was refused, as CSV.
 
-    What is unknown is empty.
+    Unknown values are empty.
     """
     costs = frame_costs(run)
     columns = {name: costs[f"frame_{name}"] for name in ("ext_ms", "cpu_ms", "mem_mb", "ene_j")}
@@ -64,7 +64,7 @@ _PLY_TYPES = {"u1": "uchar", "f4": "float"}
 def write_ply(
     path: Path, points: NDArray[np.float64], attributes: dict[str, NDArray[np.generic]]
 ) -> None:
-    """Write points (M, 3) and what is known of each, by name: (M,) or (M, 3) arrays, binary PLY.
+    """Write points (M, 3) and their attributes by name, arrays (M,) or (M, 3), as binary PLY.
 
     ``color`` is uint8, everything else 32-bit floats.
     """
@@ -88,23 +88,23 @@ def write_ply(
 
 MESH = "mesh.ply"
 _DEPTH = 9  # of the octree: 512 cells along the longest side
-_FARTHEST_SPACINGS = 3.0  # from the map's points, in typical distances between these
+_FARTHEST_SPACINGS = 3.0  # largest distance from the map's points, in units of their spacing
 
 
 def check_open3d() -> None:
-    """Refuse a mesh, before any work, where Open3D is missing.
+    """Refuse to write a mesh, before any other work, if Open3D is missing.
 
     Raises:
-        InputError: it, or a system library that it needs, is not installed.
+        InputError: Open3D, or a system library that it needs, is not installed.
     """
     load_open3d("a mesh")
 
 
 def write_mesh(path: Path, backend: SlamBackend) -> int:
-    """Write the surface of a SLAM as a mesh (PLY, binary) with colours.
+    """Write the surface of a SLAM backend as a coloured mesh (binary PLY).
 
     Screened Poisson reconstruction (Kazhdan and Hoppe, TOG 2013) closes every surface; triangles
-    far from the points that it was made of are removed again.
+    far from the original points are removed afterwards.
 
     Returns:
         Number of triangles.
@@ -132,7 +132,7 @@ def write_mesh(path: Path, backend: SlamBackend) -> int:
 
 
 def _near(vertices: Any, points: Any) -> Any:
-    """Which vertices (N,) have a point of the surface beside them."""
+    """Mask (N,) of the vertices that are close to a point of the surface."""
     tree = cKDTree(points)
     spacing = float(np.median(tree.query(points, k=2)[0][:, 1]))
     return tree.query(vertices)[0] <= max(_FARTHEST_SPACINGS * spacing, 0.02)

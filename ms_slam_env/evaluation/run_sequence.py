@@ -1,19 +1,19 @@
-"""The loop over a sequence: every frame through SLAM, and a record of what it said and cost.
+"""Run SLAM over a sequence, frame by frame, and record results and costs.
 
-All at once, with what a comparison needs::
+The whole sequence at once, with what a comparison needs::
 
     sequence = open_sequence("living_room:2000", with_truth=True)
-    meter = CostMeter()                                  # before the SLAM, whose memory it counts
+    meter = CostMeter()                                  # before SLAM, to count all its memory
     run = run_sequence(slam.make("surfel", sequence.intrinsics), sequence, meter=meter)
     ate_rmse(run.estimates, run.true_poses), run.lost, run.cpu_ms, run.backend.surface_points()
 
-Frame by frame, to look in between, to stop early, to feed the SLAM in another way::
+Frame by frame, to inspect intermediate states, stop early, or feed SLAM in another way::
 
     run = SequenceRun(backend, sequence)
     for step in run:                                     # step.index, step.frame, step.result
-        if step.result.tracking_ok: break                # what was recorded so far stays in run
+        if step.result.tracking_ok: break                # run keeps what was recorded so far
 
-After a kidnapping, from the pose and with the map that the SLAM has::
+After a kidnapping, continuing with the current pose and map::
 
     run_sequence(backend, frames, reset=False)
 """
@@ -46,12 +46,12 @@ Track = Callable[[RGBDFrame], TrackResult]
 
 @dataclass(frozen=True)
 class Step:
-    """One frame that SLAM has tracked.
+    """One frame that SLAM has processed.
 
     Attributes:
-        index: of the frame in the run.
-        frame: as it was shown.
-        result: what SLAM said.
+        index: number of the frame in the run.
+        frame: the frame given to SLAM.
+        result: SLAM's result.
     """
 
     index: int
@@ -60,26 +60,27 @@ class Step:
 
 
 class SequenceRun:
-    """A run of a SLAM over a sequence, and its record; iterate over it to let it go on.
+    """A run of SLAM over a sequence, and its record; iterate over it to process frames.
 
-    The record holds the frames tracked so far, also after a ``break`` or an error in the middle;
-    iterating again goes on behind the last of them. Frames are not kept.
+    The record holds the frames tracked so far, also after a ``break`` or an error; iterating again
+    continues with the next frame. Frames are not kept.
 
     Args:
-        backend: the SLAM, behind its frame selection or adaptation if it has one.
-        frames: a sequence, whose true poses are recorded too, or N frames without.
-        start: (4, 4) T_world_camera of the first frame; by default its true pose where that is
-            known, else the identity.
-        reset: False goes on from where the SLAM is, with its map and without ``start``.
-        meter: measures each frame, made before the SLAM; without one time alone is measured.
-        track: called in the place of ``backend.track``.
-        progress: shown at a progress bar with whether SLAM is tracking; no bar if empty.
+        backend: SLAM backend, wrapped in its frame selection or adaptation if it has one.
+        frames: a sequence, whose true poses are recorded too, or N frames without true poses.
+        start: (4, 4) T_world_camera of the first frame; by default its true pose if known,
+            otherwise the identity.
+        reset: False continues from the current pose and map, without ``start``.
+        meter: measures each frame; create it before the backend. Without one, only time is
+            measured.
+        track: called instead of ``backend.track``.
+        progress: label of a progress bar that shows whether SLAM is tracking; no bar if empty.
 
     Attributes:
-        backend: the SLAM.
+        backend: the SLAM backend.
         results: N results.
-        timestamps: N seconds.
-        costs: N costs of tracking one frame; memory and energy NaN without a meter.
+        timestamps: N times in seconds.
+        costs: N costs of tracking one frame; memory and energy are NaN without a meter.
     """
 
     def __init__(
@@ -146,12 +147,12 @@ class SequenceRun:
 
     @property
     def estimates(self) -> Float64:
-        """(N, 4, 4) estimated T_world_camera, each as it was given with its frame."""
+        """(N, 4, 4) estimated T_world_camera, each as returned with its frame."""
         return np.array([r.T_world_camera for r in self.results]).reshape(-1, 4, 4)
 
     @property
     def true_poses(self) -> Float64:
-        """(N, 4, 4) true T_world_camera; NaN where it is not known."""
+        """(N, 4, 4) true T_world_camera; NaN if unknown."""
         if self._true_poses is None:
             return np.full((len(self), 4, 4), np.nan)
         return self._true_poses[: len(self)]
@@ -163,12 +164,12 @@ class SequenceRun:
 
     @property
     def anchored(self) -> NDArray[np.bool_]:
-        """(N,) whether SLAM was tracking in the first submap or one joined to it by then."""
+        """(N,) whether SLAM was tracking in the first submap or one already joined to it."""
         return self.tracking_ok & np.array([result.submap == 0 for result in self.results])
 
     @property
     def processed(self) -> NDArray[np.bool_]:
-        """(N,) whether SLAM has seen the frame; False where frame selection dropped it."""
+        """(N,) whether SLAM processed the frame; False if frame selection dropped it."""
         return np.array([result.processed for result in self.results], dtype=bool)
 
     @property
@@ -188,16 +189,16 @@ class SequenceRun:
 
     @property
     def cpu_ms(self) -> Float64:
-        """(N,) milliseconds of processor time, of all threads, in which a frame was tracked."""
+        """(N,) milliseconds of processor time, of all threads, for tracking each frame."""
         return 1e3 * np.array([cost.cpu_s for cost in self.costs])
 
     @property
     def wall_ms(self) -> Float64:
-        """(N,) milliseconds by the clock in which a frame was tracked."""
+        """(N,) milliseconds by the clock for tracking each frame."""
         return 1e3 * np.array([cost.ext_s for cost in self.costs])
 
     def corrected(self) -> Float64 | None:
-        """(N, 4, 4) T_world_camera as the map has them now; None if the SLAM corrects none."""
+        """(N, 4, 4) T_world_camera in the current map; None if the backend corrects no poses."""
         frames, poses = self.backend.corrected_trajectory()
         own = np.asarray(frames) >= self._counted
         if not own.any():
@@ -218,7 +219,7 @@ def run_sequence(
     progress: str = "",
     on_step: Callable[[Step], None] = lambda step: None,
 ) -> SequenceRun:
-    """Track every frame; arguments as those of `SequenceRun`.
+    """Track every frame; arguments are those of `SequenceRun`.
 
     ``on_step`` is called after each frame.
     """
@@ -231,23 +232,23 @@ def run_sequence(
 
 
 def run_backend(backend: str, sequence: Sequence, **how: Any) -> SequenceRun:
-    """``run_sequence`` of a backend by name, parameters appended as in ``surfel,submaps=off``."""
+    """``run_sequence`` for a backend by name, with parameters as in ``surfel,submaps=off``."""
     name, params = parse_named(backend, "backend")
     return run_sequence(slam.make(name, sequence.intrinsics, **params), sequence, **how)
 
 
 def lost_throughout(processed: int, lost: int) -> str:
-    """A complaint where nothing was tracked beyond the frame that the map began with, else empty.
+    """A message if no frame was tracked after the one that started the map, otherwise empty.
 
     Args:
-        processed: frames that SLAM has seen.
-        lost: those of them without tracking.
+        processed: number of frames that SLAM processed.
+        lost: how many of them were not tracked.
     """
     return f"lost in {lost} of {processed} frames" if lost >= max(1, processed - 1) else ""
 
 
 class _Stopwatch:
-    """Measures time alone, without the processes' memory and energy that a `CostMeter` reads."""
+    """Measures only time, without the memory and energy that a `CostMeter` reads."""
 
     def __init__(self) -> None:
         self.frames: list[FrameCost] = []

@@ -1,4 +1,4 @@
-"""A SLAM backend over a sequence: trajectory, map, cost of every frame and metrics in a folder."""
+"""Run SLAM over a sequence; write trajectory, map, cost of every frame and metrics to a folder."""
 
 from __future__ import annotations
 
@@ -99,28 +99,29 @@ def run_to_folder(
     mesh: bool = False,
     core_watts: float = metrics.CORE_WATTS,
 ) -> dict[str, Any]:
-    """Track every frame of ``sequence`` and write what came of it to ``out``.
+    """Track every frame of ``sequence`` and write the results to ``out``.
 
-    Those that ``selection`` drops are not processed; their poses are predicted.
-    SLAM starts at the true pose of the first frame where that is known, else at the identity; or
-    somewhere in the map of file ``map_in``, which it goes on with. In the end the map is written to
-    ``map_out`` to be gone on with, and as a ``mesh`` to ``mesh.ply``. ``core_watts`` are those by
-    which energy is estimated where none can be measured.
-    While it runs, the trajectory so far stands in ``trajectory.incomplete.txt``. At the end that
-    becomes ``trajectory.txt``, beside ``map.ply``, ``frames.csv`` with what every frame cost and,
-    last, ``metrics.json``, which also says how the frames were ``fed`` to the backend. Where it
-    closes loops, ``trajectory.corrected.txt`` holds the poses as the finished map has them; where
-    the true poses are known, ``groundtruth.txt`` holds those; where there are several submaps,
-    ``submaps.csv`` says which holds each frame. A run that fails or is interrupted leaves the
-    unfinished trajectory, and ``frames.csv`` and ``metrics.json`` of the frames so far, which says
-    so.
+    Frames dropped by ``selection`` are not processed; their poses are predicted. SLAM starts at the
+    true pose of the first frame if known, otherwise at the identity; or, with ``map_in``, at an
+    unknown place in the map of that file, which it extends. At the end the map is saved to
+    ``map_out``, from which a later run can continue, and with ``mesh`` as a mesh to ``mesh.ply``.
+    ``core_watts`` is the power of a core in watts for estimating energy that cannot be measured.
+
+    During the run, ``trajectory.incomplete.txt`` holds the trajectory so far. At the end it becomes
+    ``trajectory.txt``. Further files are ``map.ply``, ``frames.csv`` with the cost of every frame
+    and, last, ``metrics.json``, which also records how the frames were ``fed`` to the backend. If
+    the backend closes loops, ``trajectory.corrected.txt`` holds the poses in the finished map. If
+    true poses are known, ``groundtruth.txt`` holds them. If there are several submaps,
+    ``submaps.csv`` assigns each frame to one. A run that fails or is interrupted leaves the
+    unfinished trajectory, and ``frames.csv`` and ``metrics.json`` for the frames so far, marked as
+    incomplete.
 
     Returns:
         the metrics in ``metrics.json``, and ``lost_reasons``, lines that say why frames were lost.
 
     Raises:
-        InputError: a bad option, a map that cannot be gone on with, or an image that cannot be
-            read; or another process works in ``out``.
+        InputError: a bad option, a map that cannot be extended, an image that cannot be read, or
+            another process working in ``out``.
         OSError: a file that cannot be written.
     """
     if mesh:
@@ -150,7 +151,7 @@ def _run(
     map_out: Path | None,
     mesh: bool,
 ) -> dict[str, Any]:
-    """Track and write, with ``out`` to itself."""
+    """Track and write, while no other process uses ``out``."""
     for old in (METRICS, TRAJECTORY, CORRECTED, TRUTH, MAP, MESH, FRAMES, SUBMAPS, REFUSED):
         (out / old).unlink(missing_ok=True)
     try:
@@ -165,7 +166,7 @@ def _run(
     except BaseException as error:
         stopped = isinstance(error, KeyboardInterrupt)
         content["error"] = recorded(error)
-        with suppress(OSError):  # a disk that is full: the poses so far are all there is
+        with suppress(OSError):  # a full disk: the poses written so far must do
             unfinished = {"complete": False, "interrupted": stopped, **content}
             _write(run, sequence, out, unfinished, refused, mesh=False)
             if stopped:
@@ -183,7 +184,7 @@ def _write(
     refused: RefusedFrame,
     mesh: bool,
 ) -> dict[str, Any]:
-    """Write what is known of a run, finished or not; return its metrics."""
+    """Write the results of a run, finished or not; return its metrics."""
     result: dict[str, Any] = {}
     with result_folder(out, METRICS) as folder:
         if content["complete"]:
@@ -210,7 +211,7 @@ def _write(
 
 
 def _write_finished(run: SequenceRun, sequence: Sequence, folder: Path) -> dict[str, Any]:
-    """Write map and other trajectories; return errors of those with loops closed, and by submap."""
+    """Write map and further trajectories; return errors after loop closure, and by submap."""
     write_ply(folder / MAP, run.backend.surface_points(), run.backend.map_attributes())
     truth, corrected = sequence.true_trajectory(), run.corrected()
     if truth is not None:
@@ -233,7 +234,7 @@ def _about(
     fed: Mapping[str, Any],
     selection: FrameSelectionConfig,
 ) -> dict[str, Any]:
-    """What was run."""
+    """Describe what was run, for ``metrics.json``."""
     recording = sequence.frames if isinstance(sequence.frames, Recording) else None
     registration = None if recording is None else recording.registration
     return {
@@ -252,11 +253,11 @@ def _about(
 
 
 def measure(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
-    """Metrics of a run, finished or not; those against the truth only where there is one.
+    """Metrics of a run, finished or not; errors only if there is ground truth.
 
-    ``frames``, ``lost_frames``, ``uncertain_frames``, ``processed_frames``, ``path_m`` of the
-    truth where all of it is known, else of the estimate; what `trajectory_errors` gives; the costs
-    by the names of ``CostMeter.summary``.
+    ``frames``, ``lost_frames``, ``uncertain_frames``, ``processed_frames``; ``path_m`` of the
+    truth if it is complete, otherwise of the estimate; the results of `trajectory_errors`; and the
+    costs of ``CostMeter.summary``.
     """
     if not len(run) or run.meter is None:
         return {"frames": 0}
@@ -275,7 +276,7 @@ def measure(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
 
 
 def _tracked_errors(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
-    """``tracked_share`` of all frames, and ``ate_tracked_m`` where the truth is known."""
+    """``tracked_share`` of all frames, and ``ate_tracked_m`` if the truth is known."""
     times, P, Q = _pairs(run, run.estimates, sequence)
     ok = run.tracking_ok[np.isin(run.timestamps, times)]
     known = metrics.tracked_errors(P, Q, ok) if len(P) > 1 else {}
@@ -283,11 +284,11 @@ def _tracked_errors(run: SequenceRun, sequence: Sequence) -> dict[str, Any]:
 
 
 def trajectory_errors(run: SequenceRun, poses: Float64, sequence: Sequence) -> dict[str, Any]:
-    """Errors of poses (N, 4, 4) against the true ones; empty without any of these.
+    """Errors of poses (N, 4, 4) against the true ones; empty without true poses.
 
-    ``poses`` that have a true one, ``unmatched_poses`` that have none; with two of them ``ate_m``
-    (RMSE after SE(3) alignment), ``ate_max_m``, ``ate_rad`` (RMSE of the orientation after it, None
-    where the path is a line), ``ate_unaligned_m``, ``rpe_m``, ``rpe_rad``.
+    ``poses`` counts those with a true pose, ``unmatched_poses`` those without. With at least two
+    true poses: ``ate_m`` (RMSE after SE(3) alignment), ``ate_max_m``, ``ate_rad`` (RMSE of the
+    orientation after it, None if the path is a line), ``ate_unaligned_m``, ``rpe_m``, ``rpe_rad``.
     """
     if sequence.true_trajectory() is None:
         return {}
@@ -320,14 +321,14 @@ def _pairs(run: SequenceRun, poses: Float64, sequence: Sequence) -> tuple[Float6
 def _submap_errors(
     run: SequenceRun, corrected: Float64 | None, sequence: Sequence
 ) -> dict[str, Any]:
-    """See `submap_errors`; of the poses as the finished map has them."""
+    """`submap_errors` of the poses in the finished map."""
     times, P, Q = _pairs(run, run.estimates if corrected is None else corrected, sequence)
     known = np.isin(run.timestamps, times)
     return dict(submap_errors(P, Q, submap_numbers(run)[known]))
 
 
 def _orientation_error(P: Float64, Q: Float64) -> float | None:
-    """RMS angle in radians between aligned and true poses; None if positions leave it open."""
+    """RMS angle in radians between aligned and true poses; None if alignment is not unique."""
     unique = metrics.find_alignment(P, Q).unique
     return metrics.ate_rmse(P, Q, kind="rotation") if unique else None
 
@@ -345,7 +346,7 @@ def _tables(result: Mapping[str, Any]) -> list[Table]:
 
 
 def _charts(run: SequenceRun, sequence: Sequence) -> list[Chart]:
-    """Path, error over time, cost of every frame."""
+    """Charts of the path, the error over time, and the cost of every frame."""
     if len(run) < 2:
         return []
     times, P, Q = _pairs(run, run.estimates, sequence)
@@ -375,7 +376,7 @@ def _charts(run: SequenceRun, sequence: Sequence) -> list[Chart]:
 
 
 def _aligned(run: SequenceRun, poses: Float64, sequence: Sequence) -> Float64:
-    """Poses (N, 4, 4) of all frames, moved onto the truth as a whole, as their errors are."""
+    """Poses (N, 4, 4) of all frames, aligned with the truth as for their errors."""
     _, P, Q = _pairs(run, poses, sequence)
     return metrics.find_alignment(P, Q).poses(poses) if len(P) > 1 else poses
 

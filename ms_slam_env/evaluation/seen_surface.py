@@ -1,4 +1,4 @@
-"""The true surface that the frames of a sequence saw: what maps are judged against."""
+"""The true surface that the frames of a sequence saw, with which maps are compared."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from ms_slam_env.sequences import CameraPath, Sequence
 
 SURFACE_SPACING_M = 0.01
 CUTOFF_M = 5.0
-"""Readings beyond do not count as seen: the simulated sensor has none, where SLAM looks farther."""
+"""Largest depth that counts as seen, also if SLAM uses more; the simulated sensor's range."""
 
-_MOST_VIEWS = 60  # neighbours see the same
+_MOST_VIEWS = 60  # neighbouring frames see the same surface
 
 
 def seen_surface(sequence: Sequence, cutoff_m: float = CUTOFF_M) -> Float64:
-    """Points (M, 3), `SURFACE_SPACING_M` apart, of what at most 60 frames saw up to ``cutoff_m``.
+    """Points (M, 3), `SURFACE_SPACING_M` apart, that at most 60 frames saw within ``cutoff_m``.
 
-    The depth is the noise-free one of a rendered sequence and the recorded one else, placed by the
-    true poses, which must be known.
+    They come from the noise-free depth of a rendered sequence or the depth of a recording, placed
+    by the true poses, which must be known.
 
     Raises:
         InputError: no reading at all, or none up to ``cutoff_m``.
@@ -46,7 +46,7 @@ def seen_surface(sequence: Sequence, cutoff_m: float = CUTOFF_M) -> Float64:
 def back_projected(
     depth: NDArray[np.float32], T_world_camera: Float64, intrinsics: Intrinsics, cutoff_m: float
 ) -> Float64:
-    """Points (M, 3) in the world of the readings up to ``cutoff_m`` of depth (H, W) in metres."""
+    """World points (M, 3) of the readings of ``depth`` (H, W), metres, up to ``cutoff_m``."""
     valid = (depth > 0) & (depth <= cutoff_m)
     return (intrinsics.rays()[valid] * depth[valid, None]) @ T_world_camera[
         :3, :3
@@ -55,21 +55,22 @@ def back_projected(
 
 @dataclass(frozen=True)
 class SequenceWithSurface(Sequence):
-    """A sequence with its truth, its frames in memory.
+    """A sequence in memory, with its ground truth.
 
     Attributes:
-        surface: (M, 3) true surface that the frames saw, about 1 cm apart, world frame.
+        surface: (M, 3) points of the true surface that the frames saw, about 1 cm apart, world
+            frame.
     """
 
     surface: Float64
 
 
 def open_with_surface(text: str, image_size: str, path: CameraPath) -> SequenceWithSurface:
-    """The sequence that ``text`` names, at ``image_size``; ``path`` is that of rendered ones.
+    """Open the sequence named ``text`` at ``image_size``; rendered ones follow ``path``.
 
     Raises:
-        InputError: a sequence that cannot be made or read, or a recording without truth or without
-            a depth reading.
+        InputError: a sequence that cannot be rendered or read, or a recording without truth or
+            depth readings.
     """
     from ms_slam_env.sequences import open_sequence
 

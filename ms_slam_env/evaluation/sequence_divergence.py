@@ -1,4 +1,4 @@
-"""How hard recorded sequences are: statistics of the divergence from frame to frame.
+"""Difficulty of sequences: statistics of the divergence between consecutive frames.
 
 Saeedi et al., ICRA 2017, section V-C and Table I: "assigning statistics of the information
 divergence, such as mean and variance, to the sequence"; "evaluated per unit of time".
@@ -36,8 +36,8 @@ _UNITS: Mapping[str, Mapping[str, str]] = {
     "earth-movers": {"intensity": "share of the grey range", "depth": "rad"},
     WASSERSTEIN: {"observation": "m"},
 }
-"""Units by kind of the measures that are no divergence in nats."""
-_WORST = 3  # frames of each kind that are named
+"""Units, by kind, of the measures that are not divergences in nats."""
+_WORST = 3  # frames of each kind listed as worst
 
 _ABOUT = (
     "How far each frame's histogram of intensity, and of depth, diverges from that of the frame "
@@ -70,25 +70,25 @@ class SequenceDivergence:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """What the columns of ``divergences`` are of."""
+        """Kind of each column of ``divergences``."""
         return tuple(self.units) or KINDS
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Unit by kind; empty where all are in nats."""
+        """Unit by kind; empty if all are in nats."""
         return _UNITS.get(self.measure, {})
 
     @property
     def word(self) -> str:
-        """What keys of the registry call the values."""
+        """Word for the values in registry keys."""
         return "distance" if self.units else "divergence"
 
     def statistics(self) -> dict[str, dict[str, float | None]]:
-        """Of each kind: per frame ``max, mean, variance, std``; ``..._per_s`` those of the rates.
+        """Statistics of each kind: ``max, mean, variance, std`` per frame, ``..._per_s`` of rates.
 
-        A rate is a divergence over the time between its two frames, nats/s; mean and variance of
-        the rates weigh each by that time, so that the mean is the sum of all divergences over the
-        whole time. None without colour.
+        A rate is a divergence divided by the time between its two frames, nats/s. Mean and variance
+        of the rates are weighted by that time, so the mean is the sum of all divergences over the
+        total time. None without colour.
         """
         return {
             kind: statistics_of(self.divergences[:, column], self.gaps_s)
@@ -99,7 +99,7 @@ class SequenceDivergence:
 def statistics_of(values: Float64, gaps_s: Float64) -> dict[str, float | None]:
     """Statistics of divergences (T,) between frames ``gaps_s`` (T,) apart, as described above.
 
-    Pairs of which nothing is known are left out; None where that is all.
+    Leaves out pairs with unknown divergence; None if no pair is left.
     """
     known = ~np.isnan(values)
     if known.any():
@@ -123,7 +123,7 @@ def statistics_of(values: Float64, gaps_s: Float64) -> dict[str, float | None]:
 def consecutive_divergences(
     frames: Iterable[RGBDFrame], intrinsics: Intrinsics, configs: Sequence[DivergenceConfig]
 ) -> Float64:
-    """Divergences (T, C, 2) of each of T + 1 frames from the one before, with C configurations."""
+    """Divergences (T, C, 2) between T + 1 consecutive frames, for C configurations."""
     measures = [make_divergence(config, intrinsics) for config in configs]
     previous = None
     rows = []
@@ -140,7 +140,7 @@ def consecutive_divergences(
 def consecutive_distances(
     frames: Iterable[RGBDFrame], poses: Float64, intrinsics: Intrinsics
 ) -> Float64:
-    """`observation_distance` (T,) of each of T + 1 frames from the one before.
+    """`observation_distance` (T,) between T + 1 consecutive frames.
 
     ``poses`` (T + 1, 4, 4) are the true ones.
     """
@@ -160,13 +160,13 @@ def sequence_divergence(
     every: int = 1,
     measure: str | None = None,
 ) -> SequenceDivergence:
-    """Divergence of every frame from the one before, taking every ``every``-th frame.
+    """Divergence of every frame from the one before, using every ``every``-th frame.
 
-    ``measure``, one of ``ALL_MEASURES``, is by default that of the configuration.
+    ``measure``, one of ``ALL_MEASURES``, is that of the configuration by default.
 
     Raises:
         InputError: fewer than two frames are left, none has a depth reading, or an image cannot
-            be read; an unknown measure; ``wasserstein`` where a true pose is not known.
+            be read; an unknown measure; ``wasserstein`` if a true pose is unknown.
     """
     if measure is not None and measure not in ALL_MEASURES:
         raise unknown("measure", measure, ALL_MEASURES)
@@ -214,7 +214,7 @@ def sequence_divergence(
 
 
 def as_metrics(measured: Sequence[SequenceDivergence]) -> list[dict[str, Any]]:
-    """Statistics and values of all sequences, by keys of the registry."""
+    """Statistics and values of all sequences, by registry key."""
     return [
         {
             "sequence": sequence.name,
@@ -229,7 +229,7 @@ def as_metrics(measured: Sequence[SequenceDivergence]) -> list[dict[str, Any]]:
 
 
 def table(measured: Sequence[SequenceDivergence]) -> Table:
-    """One line a sequence and kind, Table I's statistics and those per second."""
+    """One line per sequence and kind: the statistics of Table I, per frame and per second."""
     lines = [
         {"sequence": sequence.name, **line, "frames": len(sequence.times) + 1}
         for sequence in measured
@@ -240,7 +240,7 @@ def table(measured: Sequence[SequenceDivergence]) -> Table:
 
 
 def worst_table(measured: Sequence[SequenceDivergence]) -> Table:
-    """The frames that diverge most from the one before, by sequence and kind."""
+    """The frames with the largest divergence from the one before, by sequence and kind."""
     lines: list[dict[str, Value]] = [
         {
             "sequence": sequence.name,
@@ -260,13 +260,13 @@ def worst_table(measured: Sequence[SequenceDivergence]) -> Table:
 
 
 def _worst(values: Float64) -> list[int]:
-    """Indices of the largest values (T,), the largest first; none of those that are NaN."""
+    """Indices of the largest values (T,), largest first, without NaN."""
     order = np.argsort(-values, stable=True)[:_WORST]
     return [int(k) for k in order if not np.isnan(values[k])]
 
 
 def chart(measured: Sequence[SequenceDivergence]) -> Chart:
-    """The divergences over time, a line for each sequence; none of intensity without colour."""
+    """The divergences over time, a line per sequence; without colour, none of intensity."""
     panels = []
     for k, kind in enumerate(measured[0].kinds):
         series = []
@@ -282,7 +282,7 @@ def chart(measured: Sequence[SequenceDivergence]) -> Chart:
 
 
 def _lines(sequence: SequenceDivergence) -> list[dict[str, Any]]:
-    """The statistics of each kind, by keys of the registry."""
+    """The statistics of each kind, by registry key."""
     return [
         {
             "divergence": kind,

@@ -1,4 +1,4 @@
-"""How well the submaps of a run fit the truth, each by itself and those that were joined."""
+"""Errors of the submaps of a run against the truth, separately and after joining."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ms_slam_env._runtime.arrays import Float64, Int32
 from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env.evaluation.run_sequence import SequenceRun
 
-_FEWEST = 3  # poses that an alignment takes
+_FEWEST = 3  # poses needed for an alignment
 
 
 def submap_numbers(run: SequenceRun) -> Int32:
-    """Submap (N,) that each frame is part of at the end, the oldest it is joined to; -1: lost."""
+    """Submap (N,) of each frame at the end: the oldest one it is joined to; -1 if lost."""
     own = np.array([result.submap for result in run.results], dtype=np.int32).reshape(-1)
     return np.where(run.tracking_ok, run.backend.submaps().joined_to[own], -1).astype(np.int32)
 
@@ -35,9 +35,9 @@ def submap_measures(run: SequenceRun) -> dict[str, Any]:
 def submap_errors(poses: Float64, truth: Float64, numbers: Int32) -> dict[str, float]:
     """Errors of the submaps of final poses (N, 4, 4) against the true ones (N, 4, 4).
 
-    ``joined_ate_m`` of the frames in the first submap and those joined to it; ``submap_ate_m`` of
-    all tracked frames, each submap aligned by itself. A submap of fewer than three poses is left
-    out; what cannot be measured is missing.
+    ``joined_ate_m`` covers the frames in the first submap and in those joined to it;
+    ``submap_ate_m`` all tracked frames, with each submap aligned separately. Submaps of fewer than
+    three poses are left out; a measure without data is missing.
     """
     squares: list[Float64] = []
     found: dict[str, float] = {}
@@ -55,7 +55,7 @@ def submap_errors(poses: Float64, truth: Float64, numbers: Int32) -> dict[str, f
 
 
 def paths_by_submap(poses: Float64, numbers: Int32) -> Mapping[str, Float64]:
-    """Positions (N, 3) of each submap by name, NaN where the camera was in another."""
+    """Positions (N, 3) by submap, NaN for frames in other submaps."""
     return {
         f"submap {number}": np.where((numbers == number)[:, None], poses[:, :3, 3], np.nan)
         for number in np.unique(numbers[numbers >= 0])
@@ -63,10 +63,10 @@ def paths_by_submap(poses: Float64, numbers: Int32) -> Mapping[str, Float64]:
 
 
 def write_submaps(path: Path, run: SequenceRun) -> None:
-    """Write as CSV which submap each frame was tracked in, and which that is part of at the end.
+    """Write as CSV the submap that each frame was tracked in, and the one it is part of at the end.
 
-    The last two columns are the standard deviations (metres, degrees) of where the submap lies,
-    along the direction that is least sure; 0 where it is joined to the first.
+    The last two columns are the standard deviations (metres, degrees) of the submap's pose along
+    its most uncertain direction; 0 if it is joined to the first.
     """
     lines = ["timestamp,submap,joined_to,sigma_m,sigma_deg"]
     numbers = submap_numbers(run)

@@ -1,4 +1,4 @@
-"""Why frames of a run were refused: in words, over time, the first one beside the map's view."""
+"""Why frames of a run were refused: reasons, alignment over time, and the first refused frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ms_slam_env.slam.slam_backend import TrackResult, Views
 
 REFUSED = "refused.png"
 ALIGNMENT = ("inlier_fraction", "overlap", "residual_m", "degenerate_directions")
-"""What a ``TrackResult`` says of the alignment of a frame; keys of the registry, too."""
+"""Fields of a ``TrackResult`` about a frame's alignment, which are also registry keys."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class LostReason:
     Attributes:
         reason: in words.
         frames: their numbers, increasing.
-        inlier_fraction: median of theirs.
-        overlap: median of theirs.
+        inlier_fraction: median over these frames.
+        overlap: median over these frames.
     """
 
     reason: str
@@ -49,7 +49,7 @@ class LostReason:
 
 
 def lost_reasons(run: SequenceRun) -> list[LostReason]:
-    """Why frames were lost, the most frequent reason first; a dropped frame repeats the last."""
+    """Why frames were lost, most frequent reason first; a dropped frame repeats the last reason."""
     frames: dict[str, list[int]] = {}
     for index, result in enumerate(run.results):
         if not result.tracking_ok and result.processed:
@@ -65,7 +65,7 @@ def _median(run: SequenceRun, frames: list[int], key: str) -> float:
 
 
 def lost_table(reasons: list[LostReason]) -> Table:
-    """A row for each reason."""
+    """Table with a row for each reason."""
     keys = ("lost_reason", "lost_frames", "first_lost_frame", "inlier_fraction", "overlap")
     rows: list[dict[str, str | float]] = [
         {
@@ -82,7 +82,7 @@ def lost_table(reasons: list[LostReason]) -> Table:
 
 
 def alignment_columns(run: SequenceRun) -> dict[str, Float64]:
-    """What the alignment of each frame (N,) was like, by key."""
+    """Quality of the alignment of each frame (N,), by key."""
     return {
         key: np.array([getattr(result, key) for result in run.results], dtype=np.float64)
         for key in ALIGNMENT
@@ -98,10 +98,10 @@ def alignment_chart(run: SequenceRun) -> Chart:
 
 
 class RefusedFrame:
-    """Keeps the first refused frame with the view of the map from where the camera was held.
+    """Keeps the first refused frame, and the view of the map from the pose held at that time.
 
     Args:
-        has_map: whether there is a map before the first frame.
+        has_map: whether a map exists before the first frame.
     """
 
     def __init__(self, has_map: bool) -> None:
@@ -109,7 +109,7 @@ class RefusedFrame:
         self._found: tuple[Step, Views] | None = None
 
     def look(self, run: SequenceRun, step: Step) -> None:
-        """Take note of a frame that was just tracked, or not."""
+        """Check the frame just processed, and keep it if it is the first refused one."""
         result = step.result
         if result.tracking_ok:
             self._has_map = True
@@ -117,7 +117,7 @@ class RefusedFrame:
             self._found = step, run.backend.predict(result.T_world_camera[None])
 
     def save(self, path: Path) -> None:
-        """Draw colour and depth of frame and view; without a refused frame there is no file."""
+        """Draw colour and depth of frame and view; write no file if no frame was refused."""
         if self._found is None:
             return
         step, views = self._found

@@ -11,18 +11,18 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.report.charts import Panel, Series
 
 MOST_POINTS = 1000
-"""Of a line: more are not told apart on a screen."""
+"""Largest number of points in a line: more cannot be distinguished on a screen."""
 
 
 def thinned(count: int, most: int = MOST_POINTS) -> NDArray[np.int64]:
-    """At most ``most`` indices of ``count``, evenly spread."""
+    """At most ``most`` of ``count`` indices, evenly spaced."""
     return np.arange(0, count, max(1, -(-count // most)))
 
 
 def widest_axes(points: Float64) -> tuple[int, int]:
-    """The two axes, in order, along which points (N, 3) extend most: mostly the horizontal ones.
+    """The two axes, in order, along which points (N, 3) extend most: usually the horizontal ones.
 
-    Which axis is up differs from one data set to the next, and no file says it.
+    Which axis points up differs between data sets, and no file states it.
     """
     extent = np.nanmax(points, axis=0) - np.nanmin(points, axis=0)
     a, b = sorted(np.argsort(extent, stable=True)[-2:].tolist())
@@ -30,9 +30,9 @@ def widest_axes(points: Float64) -> tuple[int, int]:
 
 
 def path_panel(paths: Mapping[str, Float64]) -> Panel:
-    """Positions (N, 3) by name along the two axes along which they extend most, at one scale.
+    """Positions (N, 3) by name, drawn at one scale along the two axes of largest extent.
 
-    A line is broken where a row is NaN.
+    A line is interrupted where a row is NaN.
     """
     a, b = widest_axes(np.concatenate(list(paths.values())))
     series = [_line(name, points[:, a], points[:, b]) for name, points in paths.items()]
@@ -45,7 +45,7 @@ def error_panel(key: str, times: Float64, errors: Mapping[str, Float64]) -> Pane
 
 
 def marked_panel(key: str, values: Float64, lost: NDArray[np.int64]) -> Panel:
-    """Metric ``key`` (N,) over the frames; those numbered in ``lost`` (K,) are marked."""
+    """Metric ``key`` (N,) over the frames; the frames in ``lost`` (K,) are marked."""
     picked = thinned(len(values))
     series = [Series("all", picked.tolist(), values[picked].tolist(), mode="lines")]
     if len(lost):

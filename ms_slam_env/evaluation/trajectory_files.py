@@ -1,4 +1,4 @@
-"""Two trajectory files: the poses that correspond in time, and whether they can."""
+"""Match the poses of two trajectory files in time, and check that they show the same recording."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from ms_slam_env.metrics.trajectory import ALIGNMENTS, check_first
 from ms_slam_env.sequences import associate, read_trajectory
 
 _GAP_INTERVALS = 3.0
-_LEAST_SHARE = 0.5  # of the poses of the shorter trajectory
-_MOST_EXTENT = 3.0  # times as far as the other
-_LEAST_SPREAD_M = 0.02  # of a truth that stands still nothing more can be said
-_MOST_SPREAD = 0.7  # an alignment explains less than half of the variance of the positions
+_LEAST_SHARE = 0.5  # of the poses of the shorter trajectory that must correspond
+_MOST_EXTENT = 3.0  # largest ratio of the extents of the two trajectories
+_LEAST_SPREAD_M = 0.02  # below this the truth stands still, and nothing more can be checked
+_MOST_SPREAD = 0.7  # above this, alignment explains less than half of the positions' variance
 _MOST_TURN_DEG = 30.0  # of the median pose
 _FRAME_COLUMNS = ("timestamp", "tracking_ok")
-_BESIDE = "frames.csv"  # of ms-slam run, in the folder of the estimate
+_BESIDE = "frames.csv"  # written by ms-slam run into the folder of the estimate
 
 
 @dataclass(frozen=True)
@@ -41,20 +41,21 @@ class TrajectoryOptions(Checked):
 
     Attributes:
         align: ``se3``, ``sim3``, ``yaw``, ``origin`` or ``none``, see ``metrics.find_alignment``.
-            With ``sim3`` relative errors are those of the estimate after scaling, too.
-        align_first: least squares over so many of the first poses that correspond; None for all.
-        delta: how far apart the poses of a relative error are.
+            With ``sim3``, relative errors use the scaled estimate, too.
+        align_first: number of first corresponding poses to align; None for all.
+        delta: distance between the two poses of a relative error.
         delta_unit: ``frames``, ``m`` along the true path, or ``s``.
         pairs: ``all`` or ``consecutive``, see ``metrics.pose_pairs``.
         tolerance: of a delta in metres or seconds, as a share of it.
-        segments: equal pieces of the trajectory that errors are also given for.
-        segment_lengths_m: of sub-trajectories for drift; None for a tenth to a half of the path.
-        max_difference_s: largest difference between timestamps that correspond.
-        gap_s: an estimate without poses for longer was lost in between; None for three times the
+        segments: number of equal pieces of the trajectory to give errors for.
+        segment_lengths_m: lengths of sub-trajectories for drift; None for 10 % to 50 % of the
+            path.
+        max_difference_s: largest difference between corresponding timestamps.
+        gap_s: an estimate without poses for longer than this was lost; None for three times the
             median interval.
-        frames: ``frames.csv`` of ``ms-slam run``: the poses of frames that were not tracked, which
-            it writes too, are left out, and there is a gap wherever one was. Without it, one that
-            lies beside the estimate leaves none out, but adds the error of tracked frames alone.
+        frames: ``frames.csv`` of ``ms-slam run``. Poses of untracked frames, which it also
+            writes, are left out, and each leaves a gap. Without this option, a ``frames.csv``
+            beside the estimate leaves nothing out, but adds the error of the tracked frames.
     """
 
     align: str = chosen("se3", *ALIGNMENTS)
@@ -70,7 +71,7 @@ class TrajectoryOptions(Checked):
     frames: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse invalid options."""
         super().__post_init__()
         check_first(self.align, self.align_first)
         if self.delta_unit == "frames" and float(self.delta).is_integer():
@@ -89,7 +90,7 @@ class TrajectoryOptions(Checked):
 
 @dataclass(frozen=True)
 class Matched:
-    """The poses of two trajectories that correspond.
+    """The corresponding poses of two trajectories.
 
     Attributes:
         times: (N,) of the estimate, seconds.
@@ -98,11 +99,11 @@ class Matched:
         truth: (N, 4, 4).
         true_path: (M, 3) all true positions from the first of these poses to the last.
         piece: (N,) number of the piece, between gaps, that the pose belongs to.
-        gaps: (K, 2) last time before and first after each gap.
-        alignment: that was found.
-        unmatched: poses of the estimate without a true one near enough in time.
-        tracked: (N,) whether the frame was tracked; None where nothing says it.
-        tracked_share: of all poses of the estimate; None likewise.
+        gaps: (K, 2) last time before and first time after each gap.
+        alignment: the alignment found.
+        unmatched: number of estimated poses without a true pose close enough in time.
+        tracked: (N,) whether the frame was tracked; None if unknown.
+        tracked_share: share of all estimated poses; None likewise.
     """
 
     times: Float64
@@ -119,7 +120,7 @@ class Matched:
 
 
 def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matched:
-    """Read two TUM files, find the poses that correspond, and align them.
+    """Read two TUM files, match their poses in time, and align them.
 
     Raises:
         InputError: a file that cannot be read, fewer than two poses in common, no alignment.
@@ -172,13 +173,13 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
 
 
 def complaints(aligned: Float64, truth: Float64, share: float, is_turned: bool = True) -> list[str]:
-    """What speaks against two trajectories being of one recording.
+    """Signs that two trajectories are not of the same recording.
 
     Args:
         aligned: (N, 4, 4) estimate after the best alignment.
         truth: (N, 4, 4) at the same times.
-        share: of the poses of the shorter trajectory, those that correspond.
-        is_turned: whether the positions say how the estimate is turned.
+        share: share of the shorter trajectory's poses that correspond.
+        is_turned: whether the positions determine the rotation of the alignment.
     """
     found = []
     if share < _LEAST_SHARE:
@@ -213,7 +214,7 @@ def complaints(aligned: Float64, truth: Float64, share: float, is_turned: bool =
 def tracked_beside(estimate: Path, times: Float64) -> NDArray[np.bool_] | None:
     """Whether the frame of each pose (N,) was tracked, from a ``frames.csv`` beside the file.
 
-    None where there is none; one that is of other frames is left aside with a warning.
+    None if there is none; one for other frames is ignored with a warning.
     """
     path = estimate.parent / _BESIDE
     try:
@@ -227,8 +228,8 @@ def tracked_at(path: Path, times: Float64) -> NDArray[np.bool_]:
     """Whether the frames at ``times`` (N,) were tracked, from ``frames.csv`` of ``ms-slam run``.
 
     Raises:
-        InputError: a file that cannot be read, of another form (the message names file and line)
-            or of other frames; fewer than two that were tracked.
+        InputError: a file that cannot be read, is malformed (the message names file and line) or
+            is for other frames; fewer than two tracked frames.
     """
     reader = csv.DictReader(read_text(path, "frames").splitlines())
     if not set(_FRAME_COLUMNS) <= set(reader.fieldnames or ()):
@@ -236,7 +237,7 @@ def tracked_at(path: Path, times: Float64) -> NDArray[np.bool_]:
     known: dict[int, bool] = {}
     for row in reader:
         try:
-            microseconds = round(1e6 * float(row["timestamp"]))  # both are written to these
+            microseconds = round(1e6 * float(row["timestamp"]))  # precision of both files
             known[microseconds] = {"0": False, "1": True}[row["tracking_ok"]]
         except (TypeError, ValueError, OverflowError, KeyError):
             raise InputError(

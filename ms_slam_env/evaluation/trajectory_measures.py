@@ -1,4 +1,4 @@
-"""Two trajectories that correspond in time, by every measure of the registry."""
+"""Compare two matched trajectories by every measure of the registry."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ALIGNED = {
     **{"se3": "ate", "sim3": "ate_sim3", "yaw": "ate_yaw"},
     **{"origin": "ate_origin", "none": "ate_unaligned"},
 }
-"""Metric of the absolute error by alignment with all poses."""
+"""Alignment over all poses to the metric of the absolute error."""
 
 
 def evaluate_files(
@@ -42,18 +42,18 @@ def evaluate_files(
 
 
 def measure_matched(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
-    """The measures of poses that correspond, by keys of the registry.
+    """Measures of corresponding poses, by registry key.
 
     Returns:
-        ``poses`` and ``unmatched_poses`` of the estimate; ``ate_m`` (RMSE),
-        ``ate_mean_m``, ``ate_median_m``, ``ate_std_m``, ``ate_min_m``, ``ate_max_m``, and the same
-        of ``ate_rad`` (None where the path is a line), ``rpe_m`` and ``rpe_rad``; with another
-        alignment than SE(3) by all poses the key of `absolute_key` in the place of ``ate_m``;
-        ``ate_printed_m`` and ``rpe_printed_m`` of USME's equations to the letter;
-        ``tracked_share`` and, after SE(3), ``ate_tracked_m`` where it is known what was tracked;
-        ``scale`` of the alignment, ``path_m``, ``duration_s``, ``pieces`` (the same statistics by
-        piece), ``drift_by_length`` (of sub-trajectories), robustness (USME equations 9 and 10 over
-        gaps in time) and initialisation (12 and 13).
+        ``poses`` and ``unmatched_poses`` of the estimate; ``ate_m`` (RMSE), ``ate_mean_m``,
+        ``ate_median_m``, ``ate_std_m``, ``ate_min_m``, ``ate_max_m``, and the same for ``ate_rad``
+        (None if the path is a line), ``rpe_m`` and ``rpe_rad``. Alignments other than SE(3) over
+        all poses have the key of `absolute_key` instead of ``ate_m``. ``ate_printed_m`` and
+        ``rpe_printed_m`` are those of `metrics.relative.printed_errors`. ``tracked_share`` and,
+        after SE(3), ``ate_tracked_m`` are given if it is known which frames were tracked. Further
+        entries: ``scale`` of the alignment, ``path_m``, ``duration_s``, ``pieces`` (the same
+        statistics by piece), ``drift_by_length`` (of sub-trajectories), robustness (USME equations
+        9 and 10 over gaps in time) and initialisation (12 and 13).
 
     Raises:
         InputError: no two poses ``delta`` apart; more segments than poses.
@@ -96,7 +96,7 @@ def measure_matched(matched: Matched, options: TrajectoryOptions) -> dict[str, A
 
 
 def absolute(matched: Matched) -> tuple[Float64, Float64 | None]:
-    """Errors (N,) of the aligned poses: metres, and radians unless the path leaves them open."""
+    """Errors (N,) of the aligned poses: metres, and radians if the alignment is unique."""
     ate_m = metrics.absolute_errors(matched.estimate, matched.truth, "none")
     if not matched.alignment.unique:
         return ate_m, None
@@ -104,7 +104,7 @@ def absolute(matched: Matched) -> tuple[Float64, Float64 | None]:
 
 
 def statistic_keys(key: str) -> tuple[str, ...]:
-    """Keys of the statistics of an error in the order of `ErrorStatistics`.
+    """Keys of the statistics of an error, in the order of `ErrorStatistics`.
 
     ``ate_m`` itself is the root mean square, ``ate_mean_m`` the mean, and so on.
     """
@@ -122,17 +122,17 @@ def _named(
 
 
 def absolute_key(options: TrajectoryOptions, unit: str) -> str:
-    """Key of the absolute error, ``unit`` m or rad; one key means one alignment.
+    """Key of the absolute error in ``unit`` m or rad; each alignment has its own key.
 
     ``ate_m``, ``ate_sim3_m``, ``ate_yaw_m``, ``ate_origin_m`` or ``ate_unaligned_m``;
-    ``ate_first_m`` after an alignment by the first poses, as the options say.
+    ``ate_first_m`` if the options align the first poses only.
     """
     name = _ALIGNED[options.align] if options.align_first is None else "ate_first"
     return f"{name}_{unit}"
 
 
 def _tracked_error(matched: Matched, options: TrajectoryOptions) -> float | None:
-    """ATE in metres of the tracked frames, aligned by themselves; None where it is not known."""
+    """ATE in metres of the tracked frames, aligned on these frames; None if unknown."""
     ok = matched.tracked
     if ok is None or ok.sum() < 2 or absolute_key(options, "m") != "ate_m":
         return None
@@ -159,7 +159,7 @@ def _relative(matched: Matched, part: slice, options: TrajectoryOptions) -> dict
 
 
 def _relative_or_none(matched: Matched, part: slice, options: TrajectoryOptions) -> dict[str, Any]:
-    """None for a piece too short to hold a pair of poses."""
+    """Relative errors; None for a piece too short to contain a pair of poses."""
     try:
         return _relative(matched, part, options)
     except InputError:
@@ -167,7 +167,7 @@ def _relative_or_none(matched: Matched, part: slice, options: TrajectoryOptions)
 
 
 def _as_printed(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
-    """USME's (2), and of its (5) the root mean square and the median, to the letter."""
+    """USME's equation (2), and root mean square and median of (5): see `printed_errors`."""
     P, Q = matched.estimate, matched.truth
     relative = printed_relative_errors(P, Q, times=matched.times, **options.relative)
     return {
@@ -178,11 +178,11 @@ def _as_printed(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
 
 
 def _robustness(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
-    """How well the pieces between gaps in time fit together, USME equations (9) and (10)."""
+    """How well the pieces between time gaps fit together, USME equations (9) and (10)."""
     lost_s = float(np.diff(matched.gaps, axis=1).sum())
     duration = float(matched.times[-1] - matched.times[0])
     breaks = np.flatnonzero(np.diff(matched.piece)) + 1
-    # A gap stands as one untracked frame between the pieces.
+    # Each gap is represented by one untracked frame between the pieces.
     rows = np.insert(np.arange(len(matched.piece)), breaks, -1)
     align = "sim3" if options.align == "sim3" else "se3"
     gaps = {
@@ -207,7 +207,7 @@ def _robustness(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
 
 
 def _initialisation(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
-    """When the scale has settled, and how right it is, USME equations (12) and (13)."""
+    """When the scale settled, and how accurate it is, USME equations (12) and (13)."""
     known = None if options.align == "sim3" else 1.0
     found = metrics.initialisation(matched.times, matched.raw, matched.truth, global_scale=known)
     return {

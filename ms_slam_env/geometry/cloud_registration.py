@@ -1,7 +1,7 @@
-"""One point cloud brought onto another: iterative closest points, mostly by small_gicp.
+"""Point cloud registration by iterative closest points, mostly with small_gicp.
 
-Source of the use: Qu, Zhang, Yang, Dong, "USME", Navigation Positioning and Timing 2021, section
-1.2: clouds are registered, equation (6), before their distance is taken.
+Used as in Qu, Zhang, Yang, Dong, "USME", Navigation Positioning and Timing 2021, section 1.2:
+clouds are registered, equation (6), before their distance is measured.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from ms_slam_env.geometry.point_clouds import IndexedCloud, check_points, indexe
 
 REGISTRATIONS = ("none", "icp", "plane-icp", "gicp")
 CUTOFF_M = 0.5
-NEIGHBOURS = 20  # that the normal of a point is taken from
+NEIGHBOURS = 20  # used to estimate a point's normal
 _ITERATIONS = 100
-_STEP = 1e-6  # metres and radians: below it the search has ended
+_STEP = 1e-6  # metres and radians; a smaller step ends the search
 
 
 @dataclass(frozen=True)
 class CloudRegistration:
-    """Where a cloud belongs.
+    """Result of a registration.
 
     Attributes:
-        T_target_source: (4, 4) rigid motion onto the target; the identity where nothing is near.
-        converged: whether the search ended by itself.
-        iterations: of it.
-        pairs: points that had a partner within the cut-off at the end.
-        share: of them in the points that were matched.
+        T_target_source: (4, 4) rigid motion onto the target; the identity if nothing is near.
+        converged: whether the search converged.
+        iterations: number of iterations.
+        pairs: number of points with a partner within the cut-off at the end.
+        share: their share of the points that were matched.
     """
 
     T_target_source: Float64
@@ -50,25 +50,25 @@ def register_clouds(
     max_points: int = 20_000,
     neighbours: int = NEIGHBOURS,
 ) -> CloudRegistration:
-    """Rigid motion that brings ``source`` (N, 3) onto ``target`` (M, 3), metres.
+    """Find the rigid motion of ``source`` (N, 3) onto ``target`` (M, 3), in metres.
 
-    It starts from the identity, so the clouds must nearly lie on each other, as an estimated and a
-    true map do.
+    It starts from the identity, so the clouds must nearly coincide, as an estimated and a true map
+    do.
 
     Args:
         source: the cloud to move.
         target: the cloud that stays.
-        method: ``icp`` is the sum of |T a - b|^2 over nearest points (Besl and McKay, PAMI 1992),
-            ``plane-icp`` of (n_b . (T a - b))^2 (Chen and Medioni, IVC 1992), ``gicp`` weighs
-            T a - b by the shape of the surface at both (Segal et al., "Generalized-ICP", RSS 2009);
-            ``none`` leaves the source where it is.
+        method: ``icp`` minimises the sum of |T a - b|^2 over nearest points (Besl and McKay, PAMI
+            1992), ``plane-icp`` that of (n_b . (T a - b))^2 (Chen and Medioni, IVC 1992). ``gicp``
+            weights T a - b by the surface shape at both points (Segal et al., "Generalized-ICP",
+            RSS 2009). ``none`` does not move the source.
         cutoff_m: pairs farther apart are left out.
-        max_points: at most so many points of the source, evenly picked, are matched.
-        neighbours: that the normal of a point is taken from.
+        max_points: most source points to match, picked evenly.
+        neighbours: number of neighbours used to estimate a point's normal.
 
     Raises:
-        InputError: bad points, an unknown method, a cut-off that is not positive, too few points
-            for ``neighbours``.
+        InputError: invalid points, an unknown method, a cut-off that is not positive, too few
+            points for ``neighbours``.
     """
     cloud, fixed = check_points(source, "source"), indexed(target, "target")
     if method not in REGISTRATIONS:
@@ -100,7 +100,7 @@ def _small_gicp(
         target_tree=fixed[1],
         registration_type=method.upper(),
         max_correspondence_distance=cutoff_m,
-        num_threads=1,  # more would not add up in a fixed order
+        num_threads=1,  # more threads would not sum in a fixed order
         max_iterations=_ITERATIONS,
         rotation_epsilon=_STEP,
         translation_epsilon=_STEP,
@@ -116,10 +116,10 @@ def _small_gicp(
 def _plane_icp(
     source: Float64, target: Float64, cutoff_m: float, neighbours: int
 ) -> CloudRegistration:
-    """Gauss-Newton on the distances along the normals.
+    """Point-to-plane ICP by Gauss-Newton on the distances along the normals.
 
-    Not small_gicp's own PLANE_ICP: on slanted surfaces that ends millimetres from the least sum of
-    (n_b . (T a - b))^2, where this and Open3D's end.
+    small_gicp's own PLANE_ICP ends millimetres from the least sum of (n_b . (T a - b))^2 on slanted
+    surfaces; this and Open3D's reach it.
     """
     import small_gicp
     from scipy.spatial import cKDTree

@@ -1,4 +1,4 @@
-"""Point clouds: checks, voxel downsampling, alignment of points that correspond."""
+"""Point clouds: checks, voxel downsampling, alignment of corresponding points."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ def check_points(points: ArrayLike, name: str) -> Float64:
 
 
 class IndexedCloud:
-    """Points with the trees that are searched in, each built when it is first asked for.
+    """Points with their search trees, each built on first use.
 
-    Whatever compares clouds takes one in place of an array: where many clouds are compared with
-    the same one its trees are then built once.
+    Functions that compare clouds accept it instead of an array, so that the trees are built once if
+    many clouds are compared with the same one.
 
     Args:
         points: (N, 3).
-        name: of the points, for the message where they are bad.
+        name: name of the points, for error messages.
 
     Raises:
-        InputError: bad points, by their name.
+        InputError: invalid points; it names them.
     """
 
     def __init__(self, points: ArrayLike, name: str = "points") -> None:
@@ -55,19 +55,19 @@ class IndexedCloud:
         return np.array(self.points, dtype, copy=copy)
 
     def __len__(self) -> int:
-        """How many points."""
+        """Number of points."""
         return len(self.points)
 
     @cached_property
     def tree(self) -> cKDTree:
-        """For the nearest of the points, SciPy's."""
+        """SciPy's tree for nearest-neighbour search."""
         from scipy.spatial import cKDTree
 
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
     @cached_property
     def gicp(self) -> tuple[Any, Any]:
-        """The points and their tree, small_gicp's."""
+        """small_gicp's points and tree."""
         import small_gicp
 
         cloud = small_gicp.PointCloud(self.points)
@@ -75,19 +75,19 @@ class IndexedCloud:
 
 
 def indexed(points: ArrayLike | IndexedCloud, name: str) -> IndexedCloud:
-    """Points (N, 3) with their trees, which are kept where they come with them.
+    """Wrap points (N, 3) with search trees, unless they already have them.
 
     Raises:
-        InputError: bad points, by their name.
+        InputError: invalid points; it names them.
     """
     return points if isinstance(points, IndexedCloud) else IndexedCloud(points, name)
 
 
 def voxel_downsample(points: ArrayLike, voxel_m: float) -> Float64:
-    """One point per occupied voxel of side ``voxel_m``: the first one, in the given order.
+    """Keep the first point, in the given order, of each occupied voxel of side ``voxel_m``.
 
     Raises:
-        InputError: bad points, or a voxel size that is not positive.
+        InputError: invalid points, or a voxel size that is not positive.
     """
     values = check_points(points, "points")
     return values[voxel_firsts(values, voxel_m)]
@@ -97,7 +97,7 @@ def voxel_firsts(points: ArrayLike, voxel_m: float) -> NDArray[np.int64]:
     """Indices (K,), ascending, of the first point in each occupied voxel of side ``voxel_m``.
 
     Raises:
-        InputError: bad points, or a voxel size that is not positive.
+        InputError: invalid points, or a voxel size that is not positive.
     """
     values = check_points(points, "points")
     if not voxel_m > 0:
@@ -110,7 +110,7 @@ def voxel_firsts(points: ArrayLike, voxel_m: float) -> NDArray[np.int64]:
 
 
 def _firsts(keys: NDArray[np.int64], below: int) -> NDArray[np.int64]:
-    """Index (K,) of the first of each key among keys (N,) from 0 to ``below``.
+    """Index (K,) of the first occurrence of each of the keys (N,), which are in [0, below).
 
     Key and index are sorted as one number, four times as fast as a stable sort of indices by key.
     """
@@ -127,11 +127,11 @@ def umeyama(
     """Rotation R (3, 3), translation t (3,) and scale s minimising |s R source + t - target|^2.
 
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point
-    patterns", PAMI 1991, equations (38) to (43). Points (N, 3) of each set correspond by row.
-    On degenerate sets (fewer than 3 points, or all on a line) the answer is one of several best.
+    patterns", PAMI 1991, equations (38) to (43). Points (N, 3) of each set correspond by row. For
+    degenerate sets (fewer than 3 points, or all on a line) it returns one of several optima.
 
     Raises:
-        InputError: a scale is asked for and all source points coincide.
+        InputError: ``with_scale``, and all source points coincide.
     """
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     source_centred, target_centred = source - source_mean, target - target_mean
@@ -151,7 +151,10 @@ def umeyama(
 
 
 def umeyama_scales(sources: Float64, targets: Float64) -> Float64:
-    """Scales (B,) of `umeyama` for B pairs of sets (B, N, 3), to the bit; each source moves."""
+    """Scales (B,) of `umeyama` for B pairs of sets (B, N, 3), bit for bit.
+
+    The points of a source must not all coincide.
+    """
     centred, targets = (
         points - points.mean(axis=1, keepdims=True) for points in (sources, targets)
     )

@@ -9,16 +9,16 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.errors import InputError
 
 MAX_COORDINATE_M = 1e9
-"""Places farther from the origin than this are mistakes, whose squares lose all precision."""
+"""Positions farther from the origin are taken for errors; their squares lose all precision."""
 
 _IDENTITY = np.eye(4)
 
 
 def as_numbers(values: ArrayLike, name: str) -> Float64:
-    """``values`` as a float64 array.
+    """Convert ``values`` to a float64 array.
 
     Raises:
-        InputError: they are no array of numbers.
+        InputError: not an array of numbers.
     """
     try:
         if not np.iscomplexobj(values):
@@ -32,9 +32,9 @@ def check_pose(T: ArrayLike, name: str = "pose") -> Float64:
     """Return ``T`` as float64 (4, 4) after checking that it is a rigid motion.
 
     Raises:
-        InputError: not numbers, wrong shape, a value that is not finite, a place beyond
-            `MAX_COORDINATE_M`, or a rotation part that is not orthonormal to 1e-4 with
-            determinant +1.
+        InputError: not numbers, wrong shape, a value that is not finite, a position beyond
+            `MAX_COORDINATE_M`, or a rotation part that is not orthonormal to 1e-4 with determinant
+            +1.
     """
     try:
         matrix = np.asarray(T, dtype=np.float64)
@@ -47,7 +47,7 @@ def check_pose(T: ArrayLike, name: str = "pose") -> Float64:
     if not np.abs(matrix[:3, 3]).max() <= MAX_COORDINATE_M:
         raise InputError(f"{name} is farther than {MAX_COORDINATE_M:g} m from the origin")
     R = matrix[:3, :3]
-    is_rigid = (  # written out: np.allclose costs more than all the rest
+    is_rigid = (  # written out because np.allclose costs more than everything else here
         (np.abs(R @ R.T - _IDENTITY[:3, :3]) < 1e-4).all()
         and (np.abs(matrix[3] - _IDENTITY[3]) < 1e-6).all()
         and np.linalg.det(R) > 0
@@ -77,14 +77,14 @@ def invert(T: ArrayLike) -> Float64:
 
 
 def orthonormal(T: ArrayLike) -> Float64:
-    """The rigid motion next to a matrix (4, 4) that many products have worn."""
+    """The rigid motion nearest to a matrix (4, 4) with accumulated rounding errors."""
     matrix = np.asarray(T, dtype=np.float64)
     U, _, Vt = np.linalg.svd(matrix[:3, :3])
     return make_pose(U @ Vt, matrix[:3, 3])
 
 
 def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Float64:
-    """Map points (..., 3) of frame b into frame a with one motion (4, 4)."""
+    """Map points (..., 3) from frame b to frame a by one motion (4, 4)."""
     T = np.asarray(T_a_b, dtype=np.float64)
     return np.asarray(points_b, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
 

@@ -63,7 +63,7 @@ def se3_log(T: ArrayLike) -> Float64:
 
 
 def adjoint(T: ArrayLike) -> Float64:
-    """Matrix (6, 6) that takes twists of frame b to frame a; ``T`` is T_a_b; equation (175)."""
+    """Matrix (6, 6) that maps twists from frame b to frame a; ``T`` is T_a_b; equation (175)."""
     matrix = np.asarray(T, dtype=np.float64)
     R = matrix[:3, :3]
     return np.block([[R, hat(matrix[:3, 3]) @ R], [np.zeros((3, 3)), R]])

@@ -1,4 +1,4 @@
-"""Several robots: their trajectories judged as one system.
+"""Trajectory measures of several robots as one system.
 
 Source: Qu, Zhang, Yang, Dong, "USME: unified SLAM measurement and evaluation", Navigation
 Positioning and Timing 2021, equations (14) to (20).
@@ -35,11 +35,12 @@ def team_ate(
 ) -> ErrorStatistics:
     """Absolute trajectory error (m or rad) of M robots, USME equations (14) and (15).
 
-    One alignment for all: what counts is one common world. Its RMSE is (15).
+    All robots share one alignment, because they should agree on one common world. The RMSE is
+    (15).
 
     Args:
-        estimates: M trajectories T_world_camera (N_i, 4, 4), one world; positions (N_i, 3) do for
-            ``translation``.
+        estimates: M trajectories T_world_camera (N_i, 4, 4) in one world frame; positions (N_i, 3)
+            suffice for ``translation``.
         truths: likewise.
         align: ``se3``, ``sim3`` or ``none``.
         kind: ``translation``, metres, or ``rotation``, radians.
@@ -67,8 +68,8 @@ def team_rpe(
 ) -> ErrorStatistics:
     """Relative pose error (m or rad) of M robots, USME equations (16) and (17), within each robot.
 
-    Between robots it is `inter_robot_rpe`. Every robot's motions over ``delta`` count alike;
-    arguments of `relative_errors`, ``times`` of each robot.
+    For errors between robots see `inter_robot_rpe`. Motions over ``delta`` have the same weight
+    for every robot. Arguments are those of `relative_errors`, with ``times`` for each robot.
 
     Raises:
         InputError: no robot, numbers that differ, or as `relative_errors`.
@@ -91,23 +92,23 @@ def inter_robot_errors(
     kind: str = "translation",
     times: Sequence[ArrayLike] | None = None,
 ) -> Float64:
-    """Errors (K,) of where each robot is in the frame of each other one, at every common moment.
+    """Errors (K,) of each robot's pose in the frame of each other robot, at every common time.
 
-    The other reading of USME equation (16), whose text we lack: states of different robots are
-    compared. With Q_i, Q_j the true poses of two robots at a moment and P_i, P_j the estimates,
-    E_ij = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j), as in `relative_errors`, where i and j are moments of one
-    robot. No alignment enters, and each pair counts once.
+    This is another reading of USME equation (16), which our text of the paper lacks: it compares
+    states of different robots. With Q_i, Q_j the true poses of two robots at one time and P_i, P_j
+    the estimates, E_ij = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j). In `relative_errors`, i and j are two times
+    of one robot. No alignment is applied, and each pair counts once.
 
     Args:
-        estimates: M >= 2 trajectories T_world_camera (N_i, 4, 4), one world.
+        estimates: M >= 2 trajectories T_world_camera (N_i, 4, 4) in one world frame.
         truths: likewise.
         kind: ``translation``, metres, or ``rotation``, radians.
-        times: of each robot (N_i,), seconds, increasing; poses of equal times are compared.
-            Without it those of equal rows, up to the length of the shorter trajectory.
+        times: of each robot (N_i,), seconds, increasing; poses at equal times are compared. If
+            None, poses of equal index are, up to the length of the shorter trajectory.
 
     Raises:
         InputError: fewer than two robots, numbers or lengths that differ, bad poses or times, no
-            moment that two robots have in common.
+            time that two robots have in common.
     """
     _check_team(estimates, truths)
     check_kind(kind)
@@ -145,18 +146,18 @@ def inter_robot_rpe(
     kind: str = "translation",
     times: Sequence[ArrayLike] | None = None,
 ) -> ErrorStatistics:
-    """Statistics of `inter_robot_errors`, whose arguments it takes; the RMSE is USME (17)."""
+    """Statistics of `inter_robot_errors`, with the same arguments; the RMSE is USME (17)."""
     return statistics_of(inter_robot_errors(estimates, truths, kind, times))
 
 
 def task_time(times: Sequence[ArrayLike]) -> float:
-    """Seconds from the first robot's start to the last one's end, USME equation (18).
+    """Seconds from the earliest start to the latest end of any robot, USME equation (18).
 
     Args:
         times: of each robot (N_i,), seconds, increasing.
 
     Raises:
-        InputError: no robot, one without time, times that are not finite or do not increase.
+        InputError: no robot, a robot without times, times that are not finite or do not increase.
     """
     if len(times) == 0:
         raise InputError("no robot given")

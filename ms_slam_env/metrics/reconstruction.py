@@ -1,10 +1,10 @@
 """Errors of maps: precision, recall, F-score, reconstruction error (RER), completeness, distances.
 
-Clouds are compared where they lie; register them first (`register_clouds`) if that is wanted.
-Sources beside those named below: Qu, Zhang, Yang, Dong, "USME: unified SLAM measurement and
-evaluation", Navigation Positioning and Timing 2021, section 1.2; for accuracy and completion Sucar,
-Liu, Ortiz, Davison, "iMAP", ICCV 2021, section 4, and Zhu et al., "NICE-SLAM", CVPR 2022,
-which take 200,000 points evenly from the surface of either mesh.
+Clouds are compared as given; register them first (`register_clouds`) if needed. Sources besides
+those named below: Qu, Zhang, Yang, Dong, "USME: unified SLAM measurement and evaluation",
+Navigation Positioning and Timing 2021, section 1.2; for accuracy and completion Sucar, Liu, Ortiz,
+Davison, "iMAP", ICCV 2021, section 4, and Zhu et al., "NICE-SLAM", CVPR 2022, which sample 200,000
+points evenly from the surface of each mesh.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from ms_slam_env.geometry.cloud_registration import CUTOFF_M, register_clouds
 from ms_slam_env.geometry.point_clouds import IndexedCloud, check_points, indexed
 from ms_slam_env.metrics.trajectory import check_count, check_positive
 
-ICP_POINTS = 5000  # of a map, evenly picked, are enough to place it
+ICP_POINTS = 5000  # evenly picked points of a map, enough to register it
 
 
 def nearest_distances(points: ArrayLike, truth: ArrayLike | IndexedCloud) -> Float64:
-    """Distance (N,) in metres from each point (N, 3) to its nearest of ``truth`` (M, 3)."""
+    """Distance (N,) in metres from each point (N, 3) to the nearest of ``truth`` (M, 3)."""
     return indexed(truth, "truth").tree.query(check_points(points, "points"))[0]
 
 
 def precision(points: ArrayLike, truth: ArrayLike, threshold_m: float) -> float:
-    """Share of ``points`` (N, 3) nearer than ``threshold_m`` to ``truth`` (M, 3)."""
+    """Share of ``points`` (N, 3) closer than ``threshold_m`` to ``truth`` (M, 3)."""
     check_positive(threshold_m, "a threshold", "m")
     return float((nearest_distances(points, truth) < threshold_m).mean())
 
 
 def recall(points: ArrayLike, truth: ArrayLike, threshold_m: float) -> float:
-    """Share of ``truth`` (M, 3) nearer than ``threshold_m`` to ``points`` (N, 3)."""
+    """Share of ``truth`` (M, 3) closer than ``threshold_m`` to ``points`` (N, 3)."""
     return precision(truth, points, threshold_m)
 
 
 def rcm(points: ArrayLike, truth: ArrayLike, threshold_m: float = 0.05) -> float:
-    """Reconstruction completeness: share of the true points that the map has, = `recall`.
+    """Reconstruction completeness: share of the true points that the map covers, i.e. `recall`.
 
     Saeedi et al., ICRA 2017, section II-A: "the reconstructed percentage of the ground truth
     points".
@@ -59,7 +59,7 @@ def rer(points: ArrayLike, truth: ArrayLike | IndexedCloud, registration: str = 
 
     Saeedi et al., ICRA 2017, section II-A: "determined by running iterative closest point on the
     point cloud models of the world and the map. The error of the point cloud matching is used as
-    RER". With ``registration="none"`` the map stays where its estimated poses placed it; the other
+    RER". ``registration="none"`` leaves the map where its estimated poses put it; the other
     methods are those of `register_clouds`.
 
     Raises:
@@ -74,13 +74,13 @@ def rer(points: ArrayLike, truth: ArrayLike | IndexedCloud, registration: str = 
 def icp(source: ArrayLike, target: ArrayLike, cutoff_m: float = CUTOFF_M) -> Float64:
     """Rigid motion T_target_source (4, 4) by point-to-point iterative closest point.
 
-    `register_clouds` tells more, and knows other methods.
+    `register_clouds` returns more details and offers other methods.
     """
     return register_clouds(source, target, "icp", cutoff_m, ICP_POINTS).T_target_source
 
 
 def harmonic_mean(a: float, b: float) -> float:
-    """2 a b / (a + b), 0 where both are 0."""
+    """2 a b / (a + b), or 0 if both are 0."""
     return 2 * a * b / (a + b) if a + b > 0 else 0.0
 
 
@@ -90,13 +90,13 @@ RATIO_THRESHOLD_M = 0.05
 
 @dataclass(frozen=True)
 class Completion:
-    """How near a reconstruction is to the truth, and how much of that it has.
+    """Accuracy and completeness of a reconstruction.
 
     Attributes:
-        accuracy_cm: mean distance of points of the reconstruction to the truth.
-        completion_cm: mean distance of true points to the reconstruction.
-        completion_ratio: share of the true points nearer than the threshold to it; the papers
-            print it in per cent, at 5 cm.
+        accuracy_cm: mean distance from points of the reconstruction to the truth.
+        completion_cm: mean distance from true points to the reconstruction.
+        completion_ratio: share of the true points closer to the reconstruction than the
+            threshold; the papers print it in per cent, at 5 cm.
     """
 
     accuracy_cm: float
@@ -123,13 +123,13 @@ def completion(
 
 @dataclass(frozen=True)
 class CloudDistance:
-    """Distances of a cloud's points to another cloud (C2C), metres.
+    """Statistics of the distances from one cloud's points to another cloud (C2C), metres.
 
     Attributes:
-        mean: over the points.
-        std: of the distances.
+        mean: mean over the points.
+        std: standard deviation.
         rms: root mean square.
-        max: the directed Hausdorff distance.
+        max: largest, the directed Hausdorff distance.
     """
 
     mean: float
@@ -141,16 +141,16 @@ class CloudDistance:
 def statistical_inliers(
     points: ArrayLike, neighbours: int = 20, std_ratio: float = 2.0, two_sided: bool = False
 ) -> NDArray[np.bool_]:
-    """Which of ``points`` (N, 3) a statistical outlier removal keeps, (N,) bool.
+    """Mask (N,) bool of the ``points`` (N, 3) that statistical outlier removal keeps.
 
     USME, section 1.2 (1), after Rusu et al., "Towards 3D point cloud based object maps", 2008: the
-    mean distance d of a point to its ``neighbours`` nearest points, itself among them, must be
+    mean distance d of a point to its ``neighbours`` nearest points, including itself, must be
     below mean(d) + ``std_ratio`` std(d) over the cloud. A point that coincides with all its
-    neighbours is dropped too, as Open3D does. USME drops what lies outside mean(d) +- alpha std(d),
-    so also points that lie too close together: ``two_sided``.
+    neighbours is dropped too, as in Open3D. USME drops points outside mean(d) +- alpha std(d), so
+    also points that are too close together; ``two_sided`` does that.
 
     Raises:
-        InputError: bad points, fewer than 2 neighbours or fewer points than neighbours, a ratio
+        InputError: bad points, fewer than 2 neighbours, fewer points than neighbours, or a ratio
             that is not positive.
     """
     from scipy.spatial import cKDTree
@@ -171,15 +171,15 @@ def noise_ratio(
 ) -> float:
     """Share of ``points`` (N, 3) that `statistical_inliers` drops, USME equation (8): N_n / N_c.
 
-    USME removes the irrelevant points by eye; here the filter does, so that a program can.
+    USME removes irrelevant points by eye; here the filter does it automatically.
     """
     return 1.0 - float(statistical_inliers(points, neighbours, std_ratio, two_sided).mean())
 
 
 def point_spacing(points: ArrayLike) -> float:
-    """Mean distance in metres of a point (N, 3) to its nearest other: how sparse a cloud is.
+    """Mean distance in metres from a point (N, 3) to its nearest neighbour: how sparse a cloud is.
 
-    USME takes the number of points for that, which grows with the area that was mapped.
+    USME uses the number of points for this, which grows with the mapped area.
 
     Raises:
         InputError: bad points, or fewer than 2.
@@ -193,7 +193,7 @@ def point_spacing(points: ArrayLike) -> float:
 
 
 def cloud_distance(points: ArrayLike, truth: ArrayLike) -> CloudDistance:
-    """Cloud-to-cloud distance: of each of ``points`` (N, 3) to the nearest of ``truth`` (M, 3)."""
+    """Cloud-to-cloud distance from each of ``points`` (N, 3) to the nearest of ``truth`` (M, 3)."""
     distances = nearest_distances(points, truth)
     return CloudDistance(
         mean=float(distances.mean()),
@@ -206,8 +206,9 @@ def cloud_distance(points: ArrayLike, truth: ArrayLike) -> CloudDistance:
 def hausdorff_distance(points: ArrayLike, truth: ArrayLike, symmetric: bool = True) -> float:
     """Hausdorff distance in metres of clouds (N, 3) and (M, 3), USME equation (7).
 
-    Directed it is max over a in ``points`` of min over b in ``truth`` of |a - b|, which does not
-    see what ``points`` lacks; symmetric it is the larger of both directions.
+    The directed distance, which USME describes, is the maximum over a in ``points`` of the minimum
+    over b in ``truth`` of |a - b|; it ignores surface that ``points`` lacks. The symmetric distance
+    is the larger of both directions.
     """
     there = cloud_distance(points, truth).max
     return max(there, cloud_distance(truth, points).max) if symmetric else there

@@ -1,7 +1,7 @@
-"""What every key of a result means: one heading, one unit, one definition, everywhere.
+"""The metric registry: heading, unit and definition of every key of a result.
 
-The entries stand in ``registry.yaml`` beside this file. Whatever writes a result checks its keys
-here, and every table, figure and report takes heading, unit and explanation from here.
+The entries are in ``registry.yaml`` beside this file. Code that writes a result checks its keys
+here, and every table, figure and report takes headings, units and explanations from here.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ RESULTS_VERSIONS = {
     "of their own",
     5: "environments have M_I = 0.15 and M_D = 0.36, and align anew what may have slipped",
 }
-"""Version to what its algorithms are.
+"""Version to a description of its algorithms.
 
-A new one is added whenever a change of algorithms changes the numbers of an experiment.
+Add a version whenever a change of algorithms changes the numbers of an experiment.
 """
 RESULTS_VERSION = max(RESULTS_VERSIONS)
 
@@ -41,11 +41,11 @@ _OF_ENVIRONMENTS = (
     *("paper_table2", "planners", "pose_sources", "step_size", "team_mapping", "train"),
 )
 CHANGED_KINDS = {5: _OF_ENVIRONMENTS}
-"""Kinds of results that a version changed; one that is not named here changed all."""
+"""Version to the kinds of results that it changed; a version not listed here changed all."""
 
 
 def versions_since(version: int, kind: str) -> dict[int, str]:
-    """The versions after one that changed a kind of results, and what their algorithms are."""
+    """Later versions that changed this kind of results, with a description of their algorithms."""
     return {
         newer: text
         for newer, text in RESULTS_VERSIONS.items()
@@ -61,13 +61,13 @@ STATISTICS = {
     "min": "smallest",
     "max": "largest",
 }
-"""What stands for ``{statistic}`` in a key, and in the texts of its metric."""
+"""Values of ``{statistic}`` in a key to their wording in heading and definition."""
 
 _FAMILIES = {
     "{number}": r"(?<=_)\d+(?:\.\d+)?(?=cm$)",
     "{statistic}": rf"(?<=_)({'|'.join(STATISTICS)})(?=_|$)",
 }
-"""Blank in a key of the registry to what may stand there."""
+"""Placeholder in a registry key to the pattern of what may replace it."""
 
 _SCALES = {
     ("m", "mm"): 1e3,
@@ -81,10 +81,10 @@ _SCALES = {
 
 
 POINT = ExtensionPoint("metrics", "ms_slam_env.metrics", form="module:function", takes=())
-"""Where more entries are found: functions that return a mapping like that of the file."""
+"""Extension point for more entries: functions that return a mapping like that of the file."""
 
 EXTRA_METRICS = "MS_SLAM_METRICS"
-"""Variable that names more sources, with commas: YAML files or ``module:function``."""
+"""Environment variable with more sources, comma-separated: YAML files or ``module:function``."""
 
 
 @dataclass(frozen=True)
@@ -92,17 +92,17 @@ class Metric:
     """One key of a result.
 
     Attributes:
-        key: name in JSON files; a unit that could be doubted is its last part.
-        heading: of a column or an axis, without unit.
-        definition: one or two sentences for somebody who does not know it.
-        unit: that values are stored in: ``m``, ``share`` (0 to 1), ``count``, ``flag`` (true or
+        key: name in JSON files; it ends in the unit where the unit is not obvious.
+        heading: column or axis heading, without unit.
+        definition: one or two sentences for a reader who does not know the metric.
+        unit: unit of stored values: ``m``, ``share`` (0 to 1), ``count``, ``flag`` (true or
             false), ``text`` and so on; empty for a number without unit.
-        shown: unit that tables and figures show it in, ``unit`` if empty.
-        alignment: of trajectories or maps before they are compared: ``SE(3)``, ``none``, ...
-        better: ``lower`` or ``higher``; empty where neither is.
-        source: paper and equation, or where else it is defined.
+        shown: unit in tables and figures; ``unit`` if empty.
+        alignment: how trajectories or maps are aligned before comparison: ``SE(3)``, ``none``, ...
+        better: ``lower`` or ``higher``; empty if neither is.
+        source: paper and equation, or another place that defines it.
         digits: significant digits shown.
-        repeatable: whether the same code gives the same value again; times and energies do not.
+        repeatable: whether the same code reproduces the value; false for times and energies.
     """
 
     key: str
@@ -153,11 +153,11 @@ class Metric:
 def registry() -> Mapping[str, Metric]:
     """All metrics by key, in the order of the file.
 
-    Besides our own, those of entry points and of the variable ``MS_SLAM_METRICS``.
+    Includes those of entry points and of the variable ``MS_SLAM_METRICS``.
 
     Raises:
-        InputError: an entry of another form, a unit that cannot be shown as it says, or a key of
-            ours with another meaning.
+        InputError: a malformed entry, a unit that cannot be converted to the shown one, or a key
+            of ours with another meaning.
     """
     text = resources.files(__package__).joinpath("registry.yaml").read_text(encoding="utf-8")
     own = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
@@ -172,7 +172,7 @@ def registry() -> Mapping[str, Metric]:
 
 
 def _more(source: str) -> Mapping[str, Any]:
-    """Entries of an entry point or ``module:function`` that returns them, or of a YAML file."""
+    """Entries from a YAML file, or from a function (entry point or ``module:function``)."""
     try:
         is_file = source.lower().endswith((".yaml", ".yml"))
         found = (
@@ -196,17 +196,17 @@ def _metric(key: str, entry: Any) -> Metric:
     if made.better not in ("", "lower", "higher"):
         raise unknown(f"better of metric {key!r}", made.better, ("lower", "higher"))
     try:
-        made.scale  # noqa: B018 -- whether its unit can be shown as it says
+        made.scale  # noqa: B018 -- raises KeyError if the unit cannot be converted
     except KeyError:
         raise InputError(f"metric {key!r}: {made.unit} cannot be shown in {made.shown}") from None
     return made
 
 
 def metric(key: str) -> Metric:
-    """The metric of a key.
+    """The metric with this key.
 
     Raises:
-        InputError: an unknown key; the message names similar ones.
+        InputError: unknown key; the message names similar ones.
     """
     found = registry().get(key) or _of_a_family(key)
     if found is None:
@@ -221,7 +221,7 @@ def metric(key: str) -> Metric:
 def _of_a_family(key: str) -> Metric | None:
     """The metric of a key such as ``recall_3cm`` or ``rpe_mean_m``.
 
-    The entries ``recall_{number}cm`` and ``rpe_{statistic}_m`` stand for all of theirs.
+    An entry with a placeholder, such as ``recall_{number}cm``, covers all keys of its form.
     """
     for blank, pattern in _FAMILIES.items():
         for part in re.finditer(pattern, key):
@@ -236,10 +236,10 @@ def _of_a_family(key: str) -> Metric | None:
 
 
 def check_keys(result: Any) -> None:
-    """Refuse a result, at any depth, with a key that the registry does not know.
+    """Refuse a result that contains, at any depth, a key unknown to the registry.
 
     Raises:
-        InputError: naming the key.
+        InputError: unknown key, which the message names.
     """
     if isinstance(result, Mapping):
         for key, value in result.items():

@@ -1,4 +1,4 @@
-"""Relative errors of estimated trajectories (RPE): of motions between pairs of poses, and by piece.
+"""Relative pose errors (RPE) of estimated trajectories, over pairs of poses and sub-trajectories.
 
 Sources: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012; Qu, Zhang,
 Yang, Dong, "USME", Navigation Positioning and Timing 2021, equations (3) to (5).
@@ -45,17 +45,17 @@ def pose_pairs(
     pairs: str = "all",
     tolerance: float = TOLERANCE,
 ) -> Int64:
-    """Pairs (K, 2) of poses that are ``delta`` apart, USME equation (3).
+    """Index pairs (K, 2) of poses that are ``delta`` apart, USME equation (3).
 
     Args:
-        truth: T_world_camera (N, 4, 4); metres are those of the true path.
-        delta: how far apart.
+        truth: T_world_camera (N, 4, 4), which distances in metres are measured along.
+        delta: distance between the two poses of a pair.
         unit: of ``delta``: ``frames``, ``m`` along the true path, or ``s``.
-        times: (N,) seconds, increasing; needed for ``s`` only.
-        pairs: ``all``: every pose that has one is paired with the later pose nearest to ``delta``
-            away, if the distance is right to ``tolerance`` times ``delta``. ``consecutive``: each
-            pair begins where the one before ends, at the first pose at least ``delta`` away.
-        tolerance: of ``all`` in metres or seconds. Frames are counted exactly.
+        times: (N,) seconds, increasing; needed only for ``s``.
+        pairs: ``all`` pairs each pose with the later pose whose distance is closest to ``delta``,
+            if it deviates by at most ``tolerance`` times ``delta``. ``consecutive`` ends each pair
+            at the first pose at least ``delta`` away and begins the next pair there.
+        tolerance: for ``all`` in metres or seconds. Frames are counted exactly.
 
     Raises:
         InputError: bad poses, times or options, or no pair at all.
@@ -97,13 +97,12 @@ def relative_errors(
 
     With Q the true and P the estimated poses and (i, j) a pair,
     E_ij = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j); the error is the length of its translation, metres, or the
-    angle of its rotation, radians. No alignment enters; an estimate without scale must be scaled
-    first.
+    angle of its rotation, radians. No alignment is applied; an estimate without scale must be
+    scaled first. For the arguments not listed here see `pose_pairs`.
 
     Args:
         estimate: T_world_camera (N, 4, 4).
         truth: likewise, corresponding by row.
-        delta: as all but the kind, see `pose_pairs`.
         kind: ``translation`` or ``rotation``.
 
     Raises:
@@ -129,13 +128,13 @@ def motion_errors(
 
 @with_arguments_of(relative_errors)
 def rpe_statistics(errors: Float64) -> ErrorStatistics:
-    """Statistics of the relative pose error (m or rad); arguments of `relative_errors`."""
+    """Statistics of the relative pose error (m or rad), from the arguments of `relative_errors`."""
     return statistics_of(errors)
 
 
 @with_arguments_of(relative_errors)
 def rpe_rmse(errors: Float64) -> float:
-    """Root mean square of the `relative_errors` (m or rad), USME (5); takes their arguments."""
+    """Root mean square of the `relative_errors` (m or rad), USME equation (5); same arguments."""
     return statistics_of(errors).rmse
 
 
@@ -152,7 +151,7 @@ def _distances(poses: Float64, unit: str, times: ArrayLike | None) -> Float64:
 def _all(along: Float64, delta: float, reach: float) -> Int64:
     first = np.arange(len(along) - 1)
     goal = along[first] + delta
-    # The nearest later pose is one of the two that enclose the goal.
+    # The closest later pose is one of the two that enclose the goal.
     after = np.clip(np.searchsorted(along, goal), first + 1, len(along) - 1)
     before = np.maximum(after - 1, first + 1)
     nearer = np.abs(along[before] - goal) <= np.abs(along[after] - goal)
@@ -165,7 +164,7 @@ def _consecutive(along: Float64, delta: float) -> Int64:
     found = []
     first = 0
     while True:
-        # Times of 0.1 s add up to a hair more or less than 1 s.
+        # Steps of 0.1 s add up to slightly more or less than 1 s.
         goal = along[first] + max(delta - _ROUNDING, 0.5 * delta)
         second = max(first + 1, int(np.searchsorted(along, goal)))
         if second >= len(along):
@@ -180,13 +179,14 @@ LENGTH_SHARES = (0.1, 0.2, 0.3, 0.4, 0.5)
 
 @dataclass(frozen=True)
 class Drift:
-    """Relative errors over one length of path, as shares of it.
+    """Relative errors over sub-trajectories of one length, divided by that length.
 
     Attributes:
-        length_m: of the true path.
-        segments: how many sub-trajectories of this length there are.
-        translation: metres of error a metre of ``length_m``, without unit; times 100 in per cent.
-        rotation_rad_m: radians of error a metre.
+        length_m: length along the true path.
+        segments: number of sub-trajectories of this length.
+        translation: metres of error per metre of ``length_m``, without unit; times 100 for per
+            cent.
+        rotation_rad_m: radians of error per metre.
     """
 
     length_m: float
@@ -196,9 +196,9 @@ class Drift:
 
 
 def equal_pieces(count: int, pieces: int) -> Int64:
-    """Bounds (K, 2) of ``pieces`` pieces of ``count`` poses: first, and one after the last.
+    """Split ``count`` poses into ``pieces``: (K, 2) first index, and one after the last.
 
-    Lengths differ by one pose at most.
+    Lengths differ by at most one pose.
 
     Raises:
         InputError: fewer than one piece, or more pieces than poses.
@@ -213,22 +213,22 @@ def equal_pieces(count: int, pieces: int) -> Int64:
 def drifts(
     estimate: ArrayLike, truth: ArrayLike, lengths_m: Sequence[float] | None = None, every: int = 1
 ) -> list[Drift]:
-    """Relative errors over sub-trajectories of given lengths, by length.
+    """Relative errors over sub-trajectories of given lengths, one entry per length.
 
     Source: Geiger, Lenz, Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark
-    suite", CVPR 2012, whose lengths are 100 to 800 m and whose sub-trajectories begin at every 10th
-    frame. One ends at the first pose farther along the true path than its length; errors of the
+    suite", CVPR 2012, where lengths are 100 to 800 m and a sub-trajectory begins at every 10th
+    frame. It ends at the first pose farther along the true path than its length. Errors of the
     motion, as in `relative_errors`, are divided by the length.
 
     Args:
         estimate: T_world_camera (N, 4, 4).
         truth: likewise, corresponding by row.
-        lengths_m: metres; None for a tenth to a half of the true path (Zhang and Scaramuzza, "A
+        lengths_m: metres; None for 10 % to 50 % of the true path (Zhang and Scaramuzza, "A
             tutorial on quantitative trajectory evaluation", IROS 2018).
-        every: a sub-trajectory begins at every such frame.
+        every: a sub-trajectory begins at every ``every``-th frame.
 
     Returns:
-        One for each length that the path has room for; none if the truth stands still and no
+        One entry for each length that fits into the path; none if the truth stands still and no
         lengths are given.
 
     Raises:
@@ -258,21 +258,21 @@ def drifts(
 def printed_errors(
     estimate: ArrayLike, truth: ArrayLike, align: str = "se3", kind: str = "translation"
 ) -> Float64:
-    """Errors (N,), m or rad, of USME equation (1) to the letter; arguments of `absolute_errors`.
+    """Errors (N,), m or rad, of USME equation (1); takes the arguments of `absolute_errors`.
 
-    The typeset formulas are missing from the text that we have; its words (the rotation dR_i
-    between estimated and true state, N states, pairs d_k = {x_s, x_e} with e > s) are those of
-    Zhang and Scaramuzza, "A tutorial on quantitative trajectory evaluation for
-    visual(-inertial) odometry", IROS 2018, whose formulas these are:
+    The typeset formulas are missing from our text of USME. Its words (the rotation dR_i between
+    estimated and true state, N states, pairs d_k = {x_s, x_e} with e > s) match Zhang and
+    Scaramuzza, "A tutorial on quantitative trajectory evaluation for visual(-inertial) odometry",
+    IROS 2018, so their formulas are used:
 
         dR_i = R_i R'_i^T,   dp_i = p_i - dR_i p'_i                                     (1)
         ATE_rot = sqrt(1/N sum |angle(dR_i)|^2),   ATE_pos = sqrt(1/N sum |dp_i|^2)     (2)
-        RE = {the same of x_e, after x'_s was laid onto x_s}                            (4), (5)
+        RE = {the same at x_e, after aligning x'_s with x_s}                            (4), (5)
 
-    with R, p the truth and R', p' the estimate after alignment. dp_i is no distance between
-    positions: an error of orientation moves it by as much as the camera is away from the world's
-    origin, so that the same trajectories in another world have another error. `ate_rmse` has
-    |p_i - p'_i| there, as all tools do. The angles are the same.
+    with R, p the truth and R', p' the estimate after alignment. dp_i is not a distance between
+    positions: an orientation error changes it in proportion to the camera's distance from the
+    world origin, so the same trajectories in another world frame have another error. `ate_rmse`
+    uses |p_i - p'_i| instead, as other tools do. The angles are the same.
     """
     check_kind(kind)
     poses, true = check_pair(estimate, truth)
@@ -288,7 +288,7 @@ def printed_ate(errors: Float64) -> ErrorStatistics:
 def printed_relative_errors(
     estimate: ArrayLike, truth: ArrayLike, kind: str = "translation", **which: Any
 ) -> Float64:
-    """The set (K,) of USME equation (5), m or rad, of the pairs ``which`` of `pose_pairs`."""
+    """Errors (K,), m or rad, of USME equation (5); ``which`` are options of `pose_pairs`."""
     check_kind(kind)
     poses, true = check_pair(estimate, truth)
     first, second = pose_pairs(true, **which).T

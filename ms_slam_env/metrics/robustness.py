@@ -1,5 +1,5 @@
-"""Robustness: do the pieces of a trajectory between losses fit together; how long is SLAM lost?
-And when has the scale of an estimated trajectory settled, and how right is it then?
+"""Robustness and initialisation: how well the tracked pieces of a trajectory fit together, how
+long SLAM is lost, when the scale of an estimate settles, and how accurate it is then.
 
 Source: Qu, Zhang, Yang, Dong, "USME: unified SLAM measurement and evaluation", Navigation
 Positioning and Timing 2021, equations (9) to (13); after Li et al., "Survey and evaluation of
@@ -22,7 +22,7 @@ from ms_slam_env.geometry.point_clouds import umeyama, umeyama_scales
 from ms_slam_env.metrics.trajectory import check_pair, check_positions, check_positive
 
 SEGMENT_ALIGNMENTS = ("se3", "sim3")
-_POINTS_AT_ONCE = 200_000  # of windows that scales are found of together
+_POINTS_AT_ONCE = 200_000  # of all windows whose scales are computed in one batch
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class TrackingRobustness:
 
     Attributes:
         error: USME equation (10), the sum over neighbouring pieces of |log(xi_i^-1 xi_i+1)|;
-            metres, radians and, with scale, the logarithm of scales are summed as they are.
-        translation_m: its translation parts alone.
-        rotation_rad: its rotation parts alone.
-        log_scale: its scale parts alone.
+            metres, radians and, with scale, logarithms of scales are added without weights.
+        translation_m: sum of the translation parts.
+        rotation_rad: sum of the rotation parts.
+        log_scale: sum of the scale parts.
         segments: (K, 2) first frame and frame after the last of each piece.
         lost: share of the frames outside the pieces.
     """
@@ -52,10 +52,10 @@ def tracked_segments(tracked: ArrayLike, shortest: int = 3) -> NDArray[np.int64]
 
     Args:
         tracked: (N,) bool.
-        shortest: runs of fewer frames are left out.
+        shortest: leave out runs of fewer frames.
 
     Raises:
-        InputError: another shape, or no frame.
+        InputError: wrong shape or type, or no frame.
     """
     flags = np.asarray(tracked)
     if flags.ndim != 1 or flags.dtype != np.bool_ or len(flags) == 0:
@@ -79,13 +79,13 @@ def tracking_robustness(
         truth: likewise.
         tracked: (N,) bool, whether the frame was tracked.
         align: ``se3``, or ``sim3`` for systems without scale.
-        lever_m: a pose counts with its position and with the three points this far along its
-            axes. 0 is USME's equation (9), positions alone, which leaves the roll of a straight
-            piece, and the rotation of one that rests, open.
+        lever_m: each pose is represented by its position and the three points this far along its
+            axes. 0 gives USME's equation (9), positions alone, which leaves the roll of a straight
+            piece and the rotation of a stationary one undetermined.
 
     Raises:
         InputError: bad poses, lengths that differ, an unknown alignment, a negative lever, no
-            piece of at least 3 frames; ``sim3`` of a piece in which either stands still.
+            piece of at least 3 frames; ``sim3`` if estimate or truth stands still in a piece.
     """
     if align not in SEGMENT_ALIGNMENTS:
         raise unknown("alignment", align, SEGMENT_ALIGNMENTS)
@@ -136,7 +136,7 @@ def similarity_log(S: ArrayLike) -> Float64:
 
 
 def _levers(poses: Float64, lever_m: float) -> Float64:
-    """Points (4 N, 3): the positions of poses and the points along their axes."""
+    """Points (4 N, 3): the positions of poses, and the points ``lever_m`` along their axes."""
     position = poses[:, None, :3, 3]
     axes = np.swapaxes(poses[:, :3, :3], 1, 2)
     return np.concatenate([position, position + lever_m * axes], axis=1).reshape(-1, 3)
@@ -145,18 +145,18 @@ def _levers(poses: Float64, lever_m: float) -> Float64:
 def relocalisation_times(timestamps: ArrayLike, black: ArrayLike, tracked: ArrayLike) -> Float64:
     """Time (N,) in seconds from the end of each run of black frames to the next pose.
 
-    Terms of USME equation 11, t_e,i - t_s,i: t_s,i is the time of the first frame after the i-th
-    run, t_e,i that of the first frame from then on that is tracked; 0 if they are the same frame.
-    Infinite if the next run, or the end, comes first. A run at the very end counts for nothing:
-    there was no frame to be found again in.
+    Terms t_e,i - t_s,i of USME equation (11): t_s,i is the time of the first frame after the i-th
+    run, t_e,i the time of the first tracked frame from there on; 0 if they are the same frame.
+    Infinite if the next run or the end of the sequence comes first. A run at the end of the
+    sequence is ignored, since no frame follows in which SLAM could relocalise.
 
     Args:
         timestamps: (M,) of the frames, seconds, ascending.
-        black: (M,) bool, the frames that were made black.
-        tracked: (M,) bool, the frames that SLAM says it has a pose for.
+        black: (M,) bool, frames replaced by black ones.
+        tracked: (M,) bool, frames for which SLAM reports a pose.
 
     Raises:
-        InputError: arrays of other or unequal shapes, times that are not finite and ascending, or
+        InputError: arrays of wrong or unequal shapes, times that are not finite and ascending, or
             no frame at all.
     """
     times = as_numbers(timestamps, "timestamps")
@@ -181,13 +181,12 @@ def relocalisation_times(timestamps: ArrayLike, black: ArrayLike, tracked: Array
 
 @dataclass(frozen=True)
 class Relocalisation:
-    """USME equation (11) over runs of black frames, those after which SLAM was never found apart.
+    """USME equation (11) over runs of black frames, counting failures separately.
 
     Attributes:
-        mean_s: mean of the times of the runs after which SLAM was found again, seconds; NaN where
-            it was after none.
-        found: number of these runs.
-        never: number of the others, which have no time: no number of seconds stands for them.
+        mean_s: mean time of the runs after which SLAM relocalised, seconds; NaN if it never did.
+        found: number of runs after which SLAM relocalised.
+        never: number of the other runs, which have no time.
     """
 
     mean_s: float
@@ -196,10 +195,10 @@ class Relocalisation:
 
 
 def relocalisation(timestamps: ArrayLike, black: ArrayLike, tracked: ArrayLike) -> Relocalisation:
-    """Mean of those `relocalisation_times` that there are, and how many there are not.
+    """Mean of the finite `relocalisation_times`, with counts of finite and infinite ones.
 
     Raises:
-        InputError: as there.
+        InputError: as `relocalisation_times`.
     """
     times = relocalisation_times(timestamps, black, tracked)
     found = times[np.isfinite(times)]
@@ -208,13 +207,13 @@ def relocalisation(timestamps: ArrayLike, black: ArrayLike, tracked: ArrayLike) 
 
 
 def mean_relocalisation_time(timestamps: ArrayLike, black: ArrayLike, tracked: ArrayLike) -> float:
-    """Mean of :func:`relocalisation_times`: USME equation 11, (1/N) sum_i (t_e,i - t_s,i), seconds.
+    """Mean of `relocalisation_times`: USME equation (11), (1/N) sum_i (t_e,i - t_s,i), seconds.
 
-    Infinite (written and shown as "never") if SLAM was not found again after one of the runs, NaN
-    without any run; `relocalisation` tells the one from the other.
+    Infinite (written and shown as "never") if SLAM failed to relocalise after any run, NaN without
+    a run. `relocalisation` counts successes and failures separately.
 
     Raises:
-        InputError: as there.
+        InputError: as `relocalisation_times`.
     """
     times = relocalisation_times(timestamps, black, tracked)
     return float(times.mean()) if len(times) else float("nan")
@@ -222,13 +221,13 @@ def mean_relocalisation_time(timestamps: ArrayLike, black: ArrayLike, tracked: A
 
 @dataclass(frozen=True)
 class Initialisation:
-    """How a trajectory's scale settled.
+    """When and how accurately a trajectory's scale settled.
 
     Attributes:
         time_s: from the first pose to the end of initialisation; None if the scale never settles.
-        scale: s(t_init) there; None likewise.
-        scale_error: symmetric relative scale error, USME equation (13), 0 where the scale is
-            right; None likewise.
+        scale: s(t_init), the scale at that time; None likewise.
+        scale_error: symmetric relative scale error, USME equation (13), 0 if the scale is right;
+            None likewise.
     """
 
     time_s: float | None
@@ -241,8 +240,8 @@ def local_scales(
 ) -> Float64:
     """Scale s(t) (N,) of the estimate around every pose: metres of truth per unit of estimate.
 
-    Umeyama's scale of the poses at most ``window_s`` / 2 away; NaN where fewer than 3 are, or
-    where the estimate or the truth stands still.
+    Umeyama's scale over the poses at most ``window_s`` / 2 away; NaN if there are fewer than 3, or
+    if the estimate or the truth stands still.
 
     Raises:
         InputError: bad positions, times that do not increase, lengths that differ, a window that is
@@ -277,20 +276,20 @@ def initialisation(
 ) -> Initialisation:
     """Time and scale error of initialisation.
 
-    The largest relative scale in [t, t + settled_s], equation (12), is taken as
-    r(t) = max s / min s - 1; the first t at which it is below ``threshold`` ends initialisation.
-    The error there, equation (13), is (|s_g / s - 1| + |s / s_g - 1|) / 2. (The text that we have
-    of USME lacks its formulas; these are those of Li et al., on which it builds.)
+    The largest relative scale in [t, t + settled_s], equation (12), is computed as
+    r(t) = max s / min s - 1; initialisation ends at the first t at which it is below ``threshold``.
+    The error at that time, equation (13), is (|s_g / s - 1| + |s / s_g - 1|) / 2. (Our text of USME
+    lacks the formulas; these are those of Li et al., on which it builds.)
 
     Args:
         times: (N,) seconds, increasing.
-        estimate: T_world_camera (N, 4, 4) or positions (N, 3); the first is the first valid pose.
+        estimate: T_world_camera (N, 4, 4) or positions (N, 3), from the first valid pose on.
         truth: likewise.
-        window_s: of poses that a scale is taken from.
-        settled_s: how long the scale must keep.
+        window_s: length of the window of poses that each local scale is computed from, seconds.
+        settled_s: time for which the scale must stay constant, seconds.
         threshold: r_init, the largest relative change of a settled scale.
         global_scale: s_g; None for the scale that best aligns the whole trajectory, 1 for systems
-            that know scale (stereo, RGB-D, inertial).
+            with known scale (stereo, RGB-D, inertial).
 
     Raises:
         InputError: as `local_scales`; a threshold, duration or scale that is not positive.

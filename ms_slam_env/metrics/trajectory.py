@@ -1,9 +1,9 @@
-"""Absolute errors of estimated trajectories (ATE), and what every measure of trajectories needs.
+"""Absolute errors of estimated trajectories (ATE), and helpers for all trajectory measures.
 
 Sources: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012; Qu, Zhang,
 Yang, Dong, "USME", Navigation Positioning and Timing 2021, equations (1) and (2). With R_i, p_i the
 true pose and R'_i, p'_i the estimate after alignment, the errors at pose i are |p_i - p'_i| and the
-angle of R_i^T R'_i; ATE is their root mean square. USME's own (1), with p_i - dR_i p'_i, is in
+angle of R_i^T R'_i; ATE is their root mean square. The variant with p_i - dR_i p'_i is in
 `relative`.
 """
 
@@ -33,8 +33,8 @@ ERROR_KINDS = ("translation", "rotation")
 class ErrorStatistics:
     """Statistics of one error per pose or pair of poses, in the unit of the error.
 
-    ``rmse`` over the poses is what USME's equations (2) and (5) define; ``std`` is that of the
-    errors themselves, not of a sample of them.
+    ``rmse`` is the measure of USME's equations (2) and (5); ``std`` is the population standard
+    deviation.
     """
 
     rmse: float
@@ -109,7 +109,7 @@ def check_times(times: ArrayLike, count: int, name: str = "times") -> Float64:
 def check_pair(
     estimate: ArrayLike, truth: ArrayLike, need_poses: bool = True, whose: str = ""
 ) -> tuple[Float64, Float64]:
-    """Estimate and truth, checked, which correspond by row: poses (N, 4, 4) or positions (N, 3)."""
+    """Checked estimate and truth that correspond by row: poses (N, 4, 4) or positions (N, 3)."""
     check = check_poses if need_poses else check_positions
     own, true = check(estimate, f"estimate{whose}"), check(truth, f"truth{whose}")
     if len(own) != len(true):
@@ -120,20 +120,20 @@ def check_pair(
 
 
 def check_count(value: object, name: str, least: int = 1) -> None:
-    """Refuse what is no integer >= ``least``."""
+    """Refuse a value that is not an integer >= ``least``."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise InputError(f"{name} must be an integer >= {least}, got {value!r}")
 
 
 def check_positive(value: float, name: str, unit: str = "") -> None:
-    """Refuse what is not finite and above 0."""
+    """Refuse a value that is not finite and above 0."""
     is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
     if not (is_number and np.isfinite(value) and value > 0):
         raise InputError(f"{name} must be finite and > 0{unit and ' '}{unit}, got {value!r}")
 
 
 def check_kind(kind: str) -> None:
-    """Refuse what is no kind of error."""
+    """Refuse an unknown kind of error."""
     if kind not in ERROR_KINDS:
         raise unknown("kind of error", kind, ERROR_KINDS)
 
@@ -141,7 +141,7 @@ def check_kind(kind: str) -> None:
 def with_arguments_of(
     errors: Callable[P, Float64],
 ) -> Callable[[Callable[[Float64], T]], Callable[P, T]]:
-    """Let a function of errors (N,) take the arguments that ``errors`` computes them from."""
+    """Decorator: let a function of errors (N,) take the arguments of ``errors`` instead."""
 
     def wrap(summary: Callable[[Float64], T]) -> Callable[P, T]:
         @wraps(summary)
@@ -165,20 +165,21 @@ def _filled(values: Float64, name: str) -> Float64:
 
 
 ALIGNMENTS = ("se3", "sim3", "yaw", "origin", "none")
-"""Best rigid motion; with scale; turned about z alone; first pose onto first; as it is."""
+"""Rigid motion; rigid motion and scale; translation and yaw; first pose onto first; unchanged."""
 FITTED = ("se3", "sim3", "yaw")
-"""Those that are found by least squares, from all poses or the first few."""
+"""Alignments found by least squares, from all poses or the first few."""
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """Similarity that takes an estimate to the truth: x_truth = scale R x_estimate + t.
+    """Similarity that maps an estimate to the truth: x_truth = scale R x_estimate + t.
 
     Attributes:
         R: (3, 3).
         t: (3,) metres.
-        scale: 1 unless it was asked for.
-        unique: whether one rotation is the best; positions on a line, or in a point, leave it open.
+        scale: 1 unless scale was estimated.
+        unique: whether the best rotation is unique; it is not if all positions lie on a line or
+            coincide.
     """
 
     R: Float64
@@ -201,17 +202,18 @@ class Alignment:
 def find_alignment(
     estimate: ArrayLike, truth: ArrayLike, align: str = "se3", first: int | None = None
 ) -> Alignment:
-    """Best alignment of positions, in the sense of least squares (Umeyama, PAMI 1991).
+    """Least-squares alignment of positions (Umeyama, PAMI 1991).
 
-    ``yaw`` leaves rotation about the world's z axis and translation open, as a camera with an
-    inertial unit does (Zhang, Scaramuzza, "A tutorial on quantitative trajectory evaluation",
-    IROS 2018); ``origin`` lays the first pose onto the true one.
+    ``yaw`` estimates only the translation and the rotation about the world's z axis, which a
+    camera with an inertial unit leaves undetermined (Zhang, Scaramuzza, "A tutorial on
+    quantitative trajectory evaluation", IROS 2018); ``origin`` aligns the first estimated pose
+    with the first true one.
 
     Args:
-        estimate: T_world_camera (N, 4, 4), or positions (N, 3), which do not do for ``origin``.
+        estimate: T_world_camera (N, 4, 4), or positions (N, 3) except for ``origin``.
         truth: likewise, corresponding by row.
         align: ``se3`` (best rigid motion), ``sim3`` (and scale), ``yaw``, ``origin`` or ``none``.
-        first: least squares over so many poses from the start alone; None for all.
+        first: number of poses from the start to align; None for all.
 
     Raises:
         InputError: wrong shapes, no poses, lengths that differ, NaN, unknown alignment; ``sim3``
@@ -235,7 +237,7 @@ def find_alignment(
 
 
 def check_first(align: str, first: int | None) -> None:
-    """Refuse a number of poses to align by that ``align`` cannot use."""
+    """Refuse an invalid ``first`` (see `find_alignment`), or one that ``align`` cannot use."""
     if first is None:
         return
     check_count(first, "first")
@@ -244,13 +246,13 @@ def check_first(align: str, first: int | None) -> None:
 
 
 def _covariance(positions: Float64, true_positions: Float64) -> Float64:
-    """Sum (3, 3) of true times estimated positions, each around its mean."""
+    """Sum (3, 3) of outer products of true and estimated positions, each minus its mean."""
     centred = true_positions - true_positions.mean(axis=0)
     return centred.T @ (positions - positions.mean(axis=0))
 
 
 def _stands_out(value: float, size: float) -> bool:
-    """Whether ``value`` is more than what rounding leaves of numbers of this size."""
+    """Whether ``value`` exceeds the rounding error of numbers of this size."""
     return bool(value > 1e-12 * max(size, 1e-12))
 
 
@@ -275,15 +277,15 @@ def absolute_errors(
     """Errors (N,) of the poses after alignment of the positions, USME equation (1).
 
     Args:
-        estimate: T_world_camera (N, 4, 4); positions (N, 3) do for ``translation``.
+        estimate: T_world_camera (N, 4, 4); positions (N, 3) suffice for ``translation``.
         truth: likewise, corresponding by row.
         align: ``se3`` (best rigid motion), ``sim3`` (and scale), ``yaw``, ``origin`` or ``none``.
         kind: ``translation``, metres, or ``rotation``, radians.
-        first: aligned by so many poses from the start alone; None for all.
+        first: number of poses from the start to align; None for all.
 
     Raises:
         InputError: as `find_alignment`; an unknown kind; ``rotation`` after an alignment whose
-            rotation is open, because the positions lie on a line.
+            rotation is not unique, because the positions lie on a line.
     """
     check_kind(kind)
     found = find_alignment(estimate, truth, align, first)
@@ -301,20 +303,20 @@ def absolute_errors(
 
 @with_arguments_of(absolute_errors)
 def ate_statistics(errors: Float64) -> ErrorStatistics:
-    """Statistics of the absolute trajectory error (m or rad); arguments of `absolute_errors`."""
+    """Statistics of the absolute trajectory error (m or rad), from `absolute_errors`' arguments."""
     return statistics_of(errors)
 
 
 @with_arguments_of(absolute_errors)
 def ate_rmse(errors: Float64) -> float:
-    """Root mean square of the `absolute_errors` (m or rad), USME (2); takes their arguments."""
+    """Root mean square of the `absolute_errors` (m or rad), USME equation (2); same arguments."""
     return statistics_of(errors).rmse
 
 
 def tracked_errors(
     estimate: ArrayLike, truth: ArrayLike, tracked: ArrayLike
 ) -> dict[str, float | None]:
-    """What belongs beside an ATE, which contains the poses that are held while tracking is lost.
+    """ATE and share of the tracked frames; the plain ATE counts poses held while tracking is lost.
 
     Args:
         estimate: T_world_camera (N, 4, 4), or positions (N, 3).
@@ -322,8 +324,8 @@ def tracked_errors(
         tracked: (N,) bool, whether the frame was tracked.
 
     Returns:
-        ``tracked_share`` of the frames, and ``ate_tracked_m`` (RMSE) of those alone, after SE(3)
-        alignment by themselves; None with fewer than two.
+        ``tracked_share``, and ``ate_tracked_m`` (RMSE) of the tracked frames after their own SE(3)
+        alignment; None for fewer than two frames.
     """
     own, true = check_pair(estimate, truth, need_poses=False)
     ok = np.asarray(tracked, dtype=bool)

@@ -1,13 +1,13 @@
-"""C++ inside Warp's kernels: functions in headers, which ``native_source`` reads.
+"""C++ code for Warp kernels: functions in headers, which ``native_source`` reads.
 
-Warp takes the body of a native function as text and has no place for headers. So here stand whole
-functions, which an editor and a compiler understand (C++20: a parameter's type is ``auto``), and
-their bodies are spliced into Warp's source together with the headers that theirs includes.
-``#line`` keeps a compiler's messages at the right line.
+Warp takes the body of a native function as text, without headers. These headers contain whole
+functions that an editor and a compiler understand (C++20: parameter types are ``auto``). Their
+bodies are inserted into Warp's source, together with the headers that they include. ``#line`` keeps
+compiler messages at the right line.
 
-Warp's own indexing is checked in its debug mode, ``VIEW`` and ``ELEMENT`` of ``checked.h`` where
-``MS_SLAM_ENV_CHECKED=1``, which also sets that mode: the same kernels, slower; an index outside an
-array ends the process with its name.
+``MS_SLAM_ENV_CHECKED=1`` checks array bounds in ``VIEW`` and ``ELEMENT`` of ``checked.h``, and
+enables Warp's debug mode, which checks Warp's own indexing. The kernels are the same but slower; an
+index out of bounds ends the process with the array's name.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ if CHECKED:
 
 @lru_cache
 def read_header(name: str) -> str:
-    """Return the text of a header; what functions include must include nothing itself."""
+    """Return the text of a header; an included header must not include others."""
     return (_HERE / f"{name}.h").read_text(encoding="utf-8")
 
 
 def native_source(header: str, function: str, **given: int | float) -> str:
-    """Source for ``wp.func_native``: the body of a function of a header.
+    """Source for ``wp.func_native``: the body of a function in a header.
 
     Args:
         header: name without ``.h``.
-        function: its name there; its parameters are those of the Python stub, in that order.
-        given: values of the constants that the header asks for (``GIVEN``), all of them.
+        function: name of the function; its parameters are those of the Python stub, in that order.
+        given: values for all constants that the header declares with ``GIVEN``.
 
     Raises:
-        KeyError: the header has no such function, or asks for other constants.
+        KeyError: the header has no such function, or declares other constants.
     """
     text = read_header(header)
     names = re.findall(r"^GIVEN\(\w+, (\w+)\);", text, re.MULTILINE)
@@ -61,7 +61,7 @@ def native_source(header: str, function: str, **given: int | float) -> str:
             *(["#define MS_SLAM_CHECKED"] if CHECKED else []),
             *(f'#line 1 "{name}.h"\n{_without_guard(name)}' for name in included),
             *(_constant(name, value) for name, value in given.items()),
-            "{",  # what a body has to say first, as a pragma of Clang, still comes first
+            "{",  # a Clang pragma at the start of the body stays first
             f'#line {line} "{header}.h"',
             f"{body}}}",
         ]

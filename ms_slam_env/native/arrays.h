@@ -1,4 +1,4 @@
-// Single values of contiguous arrays, without Warp's negative indices and strides; see device.py.
+// Element access in contiguous arrays, without Warp's negative indices and strides; see device.py.
 #pragma once
 
 #include "checked.h"
@@ -45,7 +45,7 @@ void put_vec3_in_row(const auto& values, int row, int i, const auto& value) {
     p[2] = value.c[2];
 }
 
-// Make value i at least `value`, also when other threads do so at the same time.
+// Raise value i to at least `value`, atomically.
 void raise_to(const auto& values, int i, float value) {
     wp::atomic_max(&ELEMENT(values, i), value);
 }

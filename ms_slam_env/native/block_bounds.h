@@ -1,11 +1,11 @@
-// Boxes of blocks of surfels; see block_bounds.py.
+// Bounding boxes of surfel blocks; see block_bounds.py.
 #pragma once
 
 #include "checked.h"
 
 GIVEN(int, BLOCK_SIZE);
 
-// Set box and expiry of the block of the `n` surfels from `first` on.
+// Set box and expiry of the block of `n` surfels that starts at `first`.
 void bound(const auto& surfels, const auto& blocks, int b, int first, int n, float threshold) {
     const size_t start = size_t(b) * surfels.radius.shape[1] + first;
     const auto p = VIEW(const float, surfels.position, 3 * start, 3 * n);

@@ -1,15 +1,15 @@
 // Access to Warp's arrays. In a checked build (MS_SLAM_ENV_CHECKED=1) every index is compared with
-// the array's size, or with the part of it that a function may touch; otherwise these are pointers.
+// the array's size, or with the part that a function may access; otherwise these are pointers.
 //
-//     ELEMENT(array, i)             element i, counted without regard to the dimensions
-//     VIEW(T, array, first, count)  the `count` values of type T from the `first` on, as a pointer
+//     ELEMENT(array, i)             element i of the flattened array
+//     VIEW(T, array, first, count)  `count` values of type T starting at `first`, as a pointer
 //     WITHIN(i, count, what)        index i, which must be in [0, count)
 //     PACKED(T, pointer)            several values as one vector
-//     RESTRICT(T)                   type of a pointer that aliases no other one
-//     GIVEN(T, name)                a constant whose value Python gives (`native_source`)
+//     RESTRICT(T)                   pointer type that does not alias others
+//     GIVEN(T, name)                a constant whose value comes from Python (`native_source`)
 #pragma once
 
-#define GIVEN(T, name) constexpr T name = T(1)  // for who reads a header by itself
+#define GIVEN(T, name) constexpr T name = T(1)  // for tools that read a header alone
 
 #if !defined(MS_SLAM_CHECKED)
 
@@ -39,7 +39,7 @@ const auto ms_view = [](auto* data, long long size, long long first, long long c
                          const char* what) {
     struct View {
         decltype(data) at;
-        long long low, high;  // of the indices that are allowed
+        long long low, high;  // allowed indices
         const char* what;
 
         auto& operator[](long long i) const { return at[MsBounds::within(i, low, high, what)]; }
@@ -66,7 +66,7 @@ const auto ms_view = [](auto* data, long long size, long long first, long long c
 
 #endif
 
-// Put before a loop whose turns are independent: eight at a time.
+// Precedes a loop with independent iterations: run eight at a time.
 #if defined(__clang__) && !defined(__CUDA_ARCH__)
 #define VECTORISE \
     _Pragma("clang loop vectorize(assume_safety) vectorize_width(8) interleave(disable)")

@@ -1,12 +1,12 @@
-// Voxels of true surface that are mapped in their place; see coverage.py.
+// Voxels of the true surface that are mapped correctly; see coverage.py.
 //
-// The products of a matrix and a vector are summed in the order of BLAS, with its fused additions
-// where the processor has them, so that they are what NumPy makes of them, bit for bit.
+// Matrix-vector products are summed in the order of BLAS, with fused multiply-add where the
+// processor has it, so that they equal NumPy's bit for bit.
 #pragma once
 
 #include "checked.h"
 
-// Mark what `mark_seen` says.
+// Implements `mark_seen`.
 void mark_points(
     const auto& depth, const auto& rays, const auto& poses, const auto& grid, const auto& reachable,
     const auto& mapped, const auto& counts) {

@@ -1,7 +1,7 @@
 // Noise of a structured-light depth camera along a row of pixels; see depth_noise.py.
 //
-// No branch depends on the pixel, so Clang makes vector instructions of the loop: a fifth of the
-// time of one call of Warp a pixel (160x120).
+// No branch depends on the pixel, so Clang vectorises the loop: it takes a fifth of the time of
+// one Warp call per pixel (160x120).
 #pragma once
 
 #include "checked.h"
@@ -17,7 +17,7 @@ void measure_span(
     const int pixels = camera.height * camera.width;
     const auto face_of = VIEW(const int, hit_face, 0, first + pixels);
     const auto z_of = VIEW(const float, hit_t, 0, first + pixels);
-    const auto normal_of = VIEW(const float, face_normal, 0, 3 * face_normal.shape[0]);  // 3 a face
+    const auto normal_of = VIEW(const float, face_normal, 0, 3 * face_normal.shape[0]);  // 3 per face
     const float half_pi = 1.570796327f;
     const float px = T.data[0][3], py = T.data[1][3], pz = T.data[2][3];
     const float last_x = (float)(camera.width - 1);
@@ -27,7 +27,7 @@ void measure_span(
 
     const auto smaller = [](float a, float b) { return a < b ? a : b; };
     auto larger = [](float a, float b) { return a > b ? a : b; };
-    auto acos_of = [](float x) {  // of 0 to 1, error 2e-8: Abramowitz and Stegun 4.4.46
+    auto acos_of = [](float x) {  // for 0 to 1, error 2e-8: Abramowitz and Stegun 4.4.46
         const float top = 0.0066700901f - 0.0012624911f * x;
         const float high = 0.0308918810f + x * (-0.0170881256f + x * top);
         const float low = 0.0889789874f + x * (-0.0501743046f + x * high);
@@ -68,7 +68,7 @@ void measure_span(
         is_read = is_read && face_of[j] >= 0;
         const int sampled = face_of[j] >= 0 ? face_of[j] : 0;
 
-        // The sampled surface, met by the jittered ray; a lens shifts it as it does the pixel's.
+        // The jittered ray hits the sampled surface; distortion shifts both rays alike.
         const float ex = (u - camera.cx) / camera.fx + (is_bent ? bent[2 * pixel] - plain_x : 0.0f);
         const float ey
             = (v - camera.cy) / camera.fy + (is_bent ? bent[2 * pixel + 1] - plain_y : 0.0f);
@@ -108,7 +108,7 @@ void measure_span(
         is_read = is_read && !(chance < drop);
         is_read = is_read && z >= noise.min_range && z <= noise.max_range;
 
-        // Axial noise [N], metres; its second term from 60 degrees on.
+        // Axial noise [N], metres; its second term applies above 60 degrees.
         const float a = angle / (half_pi - tilt);
         const float steep = angle > AXIAL_KNEE ? 0.0001f / sqrtf(z) * a * a : 0.0f;
         const float sigma = (0.0012f + 0.0019f * (z - 0.4f) * (z - 0.4f) + steep) * noise.axial;
@@ -117,7 +117,7 @@ void measure_span(
         const float axial = sqrtf(rest) * ELEMENT(normals, axial_word & 65535u);
         z = noise.axial > 0.0f ? z + axial : z;
 
-        // Disparity quantisation [K]; 0.49999997 rounds halves up and nothing else.
+        // Disparity quantisation [K]; 0.49999997 rounds halves up, and nothing smaller.
         const float steps_all = noise.disparity_at_1m / (larger(z, 1.0e-3f) * noise.step);
         const float steps = floorf(steps_all + 0.49999997f);
         is_read = is_read && (noise.step <= 0.0f || steps >= 1.0f);

@@ -1,11 +1,11 @@
-// Which blocks, then which surfels, a camera may see; see frustum_culling.py.
+// Find the blocks, then the surfels, that a camera may see; see frustum_culling.py.
 #pragma once
 
 #include "checked.h"
 
-// List those of the blocks from `first` on that reach into a frustum; how many were tested.
+// List the blocks from `first` on that intersect a frustum; return how many were tested.
 //
-// A block is left out only if its box is wholly outside of one plane of the frustum.
+// A block is culled only if its box is entirely outside one plane of the frustum.
 int list_some_visible_blocks(
     const auto& blocks, int b, int first, int end, const auto& frustum, int row) {
 #if defined(__CUDA_ARCH__)
@@ -17,7 +17,7 @@ int list_some_visible_blocks(
     const size_t start = size_t(b) * blocks.low.shape[1] + first;
     const auto low = VIEW(const float, blocks.low, 3 * start, 3 * n);
     const auto high = VIEW(const float, blocks.high, 3 * start, 3 * n);
-    // The planes of the frustum: a point p of the camera's frame is inside where m . p + d > 0.
+    // The planes of the frustum: a point p in the camera frame is inside if m . p + d > 0.
     const wp::mat33 R = frustum.R;
     const wp::vec3 t = frustum.t;
     const float inwards[6][3] = {{0.0f, 0.0f, 1.0f},           {0.0f, 0.0f, -1.0f},
@@ -35,7 +35,7 @@ int list_some_visible_blocks(
             + (plane == 0       ? -frustum.z_near
                    : plane == 1 ? frustum.z_far
                                 : 0.0f);
-        // Room for rounding, which grows with the numbers that are added.
+        // Margin for rounding, which grows with the terms of the sum.
         const float size = fabsf(ax) + fabsf(ay) + fabsf(az);
         const float shift = fabsf(m[0] * t[0]) + fabsf(m[1] * t[1]) + fabsf(m[2] * t[2]);
         for (int k = 0; k < n; ++k) {
@@ -61,13 +61,13 @@ int list_some_visible_blocks(
     return n;
 }
 
-// List the visible ones of the surfels from `first` on; how many were looked at.
+// List the visible surfels from `first` on; return how many were tested.
 //
-// Several at a time on the CPU, at most to `end`; a thread of a GPU looks at one.
+// Several at a time on the CPU, at most to `end`; one per thread on a GPU.
 //
-// Discs of radius r pixels that make one surface number about 1 / r^2 a pixel: where `layers`
-// of the frustum is finite one of them is listed with the probability `layers` r^2, by its slot
-// in the map, so always or never.
+// A surface consists of about 1 / r^2 discs of radius r pixels per pixel. If `layers` of the
+// frustum is finite, a surfel is listed with probability `layers` r^2. The choice depends on its
+// slot in the map, so it is always the same.
 int list_some_visible(
     const auto& surfels, int b, int first, int end, const auto& frustum, int seen_from, int seen_to,
     int row, const auto& visible) {

@@ -57,7 +57,7 @@ void accumulate_points(
     const float photometric_limit
         = weights.photometric_inlier * wp::min(photometry.reference, 2.0f);
 
-    // Six rows of eight: a row of H, the component of g, and a zero that makes it eight.
+    // Six rows of eight: a row of H, the component of g, and a zero for padding.
     float system[48] = {}, photometric[48] = {};
     float cost = 0, squared = 0, sum_w = 0, sum_wm = 0, sum_wmm = 0, sum_wr = 0, sum_wmr = 0,
           rough = 0;
@@ -68,7 +68,7 @@ void accumulate_points(
     for (int first = start; first < end; first += LANES * stride) {
         const int left = (end - first + stride - 1) / stride;
         const int n = left < LANES ? left : LANES;
-        // Where the points are in the live image.
+        // Project the points into the live image.
         float x[LANES], y[LANES], z[LANES], u[LANES], v[LANES];
         int is_point[LANES], is_visible[LANES];
         for (int k = 0; k < n; ++k) {
@@ -98,7 +98,7 @@ void accumulate_points(
         }
         visible += seen;
 
-        // What is there: the live surface, interpolated grey values and gradients, the model's own.
+        // Read the live surface, interpolated grey values and gradients, and the model's values.
         float lx[LANES], ly[LANES], lz[LANES], lnx[LANES], lny[LANES], lnz[LANES];
         float nx[LANES], ny[LANES], nz[LANES], grey[LANES], right[LANES], down[LANES];
         float corners[4][3][LANES];
@@ -132,8 +132,8 @@ void accumulate_points(
             z[m] = z[k];
         }
 
-        // Residuals, weights and derivatives. No branches: noise would make each a guess. What does
-        // not apply gets the weight 0.
+        // Residuals, weights and derivatives. No branches: noise makes them unpredictable. Terms
+        // that do not apply get weight 0.
         float r[LANES], w[LANES], ax[LANES], ay[LANES], az[LANES];
         float r2[LANES], w2[LANES], gx[LANES], gy[LANES], gz[LANES], bx[LANES], by[LANES],
             bz[LANES];
@@ -144,7 +144,7 @@ void accumulate_points(
             const float per_sigma = weights.per_depth_noise * per_z * per_z;
             const float gap = fabsf(lz[m] - z[m]);
             const bool is_matched = lz[m] > 0.0f;
-            const bool is_other = is_matched & (gap > weights.distance_m);  // of another colour too
+            const bool is_other = is_matched & (gap > weights.distance_m);  // its colour differs too
             const float a = R.data[0][0] * nx[m] + R.data[0][1] * ny[m] + R.data[0][2] * nz[m];
             const float b = R.data[1][0] * nx[m] + R.data[1][1] * ny[m] + R.data[1][2] * nz[m];
             const float c = R.data[2][0] * nx[m] + R.data[2][1] * ny[m] + R.data[2][2] * nz[m];
@@ -206,7 +206,7 @@ void accumulate_points(
             w2[m] = is_textured ? rgb * robust2 * per_variance : 0.0f;
         }
 
-        // Sums, in the order of the points: weight J J^T and weight J residual.
+        // Sum weight J J^T and weight J residual in the order of the points.
         for (int m = 0; m < seen; ++m) {
             cost += cost_icp[m];
             cost += cost_rgb[m];

@@ -1,4 +1,4 @@
-// Eight rays at a time by Embree. Layouts: RTCRayHit8 and RTCIntersectArguments of
+// Casts eight rays at a time with Embree. Layouts: RTCRayHit8 and RTCIntersectArguments of
 // embree4/rtcore_ray.h and rtcore_common.h.
 #pragma once
 
@@ -50,7 +50,7 @@ void cast_tile(
     Arguments arguments = {coherent, none, nullptr, nullptr, nullptr};
     reinterpret_cast<void (*)(const int*, void*, RayHit8*, Arguments*)>(intersect)(
         valid, reinterpret_cast<void*>(scene), &r, &arguments);
-    double p[3][8] = {}, a[3][8] = {}, b[3][8] = {};  // a corner, and the edges from it
+    double p[3][8] = {}, a[3][8] = {}, b[3][8] = {};  // a corner and the edges from it
     for (int k = 0; k < 8; ++k) {
         if (r.primitive[k] == none) continue;
         const wp::vec3i corners = ELEMENT(faces, r.primitive[k]);

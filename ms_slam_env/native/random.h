@@ -1,8 +1,8 @@
-// Random words that need no state. Source: Jarzynski and Olano, "Hash Functions for GPU Rendering",
+// Stateless random numbers. Source: Jarzynski and Olano, "Hash Functions for GPU Rendering",
 // JCGT 2020.
 #pragma once
 
-// A hash of 32 bits.
+// A 32-bit hash.
 const auto pcg = [](unsigned x) {
     const unsigned state = x * 747796405u + 2891336453u;
     const unsigned word = ((state >> ((state >> 28) + 4u)) ^ state) * 277803737u;

@@ -1,17 +1,17 @@
-// Images of a rolling shutter levelled to one instant; see rolling_shutter.py.
+// Rectifies rolling-shutter images to one instant; see rolling_shutter.py.
 #pragma once
 
 #include "checked.h"
 
-GIVEN(int, PIECE);  // columns that are worked on together
+GIVEN(int, PIECE);  // columns processed together
 
-// Fill a piece of row v of the levelled images of env b, all of its pixels step by step.
+// Fill a piece of row v of env b's rectified images, all its pixels step by step.
 void level_piece(const auto& rows, int b, int v, int piece, const auto& color, const auto& depth) {
-    constexpr int STEPS = 2;  // of the search for the point that comes to lie in a pixel
+    constexpr int STEPS = 2;  // of the search for the point that moves into a pixel
     constexpr float NEAR_SQUARED
-        = 0.25f;  // a pixel in which none does, to half a pixel, has no depth
+        = 0.25f;  // a pixel without such a point within half a pixel has no depth
     constexpr float SAME_SURFACE
-        = 0.03f;  // largest difference of inverse depth of one surface, 1/m
+        = 0.03f;  // largest difference of inverse depth within one surface, 1/m
     const int width = rows.size[0], height = rows.size[1];
     const int first = piece * PIECE, n = width - first < PIECE ? width - first : PIECE;
     const size_t image = size_t(b) * width * height;
@@ -26,8 +26,8 @@ void level_piece(const auto& rows, int b, int v, int piece, const auto& color, c
         return low < most ? low : most;
     };
     float x[PIECE], y[PIECE], z[PIECE], qx[PIECE], qy[PIECE], qz[PIECE];
-    // Where the points at depth z of row y lie at the time of the middle row: to second order in
-    // the turn; what has no depth, z = 0, is far away.
+    // Positions of the points at depth z of row y at the time of the middle row, to second order in
+    // the rotation; pixels without depth, z = 0, are far away.
     const auto to_middle = [&]() {
         for (int k = 0; k < n; ++k) {
             const float s = (y[k] + 0.5f) * per_height - 0.5f;
@@ -73,7 +73,7 @@ void level_piece(const auto& rows, int b, int v, int piece, const auto& color, c
         down[k] = w - (float)row;
         at[k] = row * width + column;
     }
-    // Inverse depth between the pixels that show the surface of the nearest one.
+    // Interpolate inverse depth between the pixels on the same surface as the nearest one.
     for (int k = 0; k < n; ++k) nearest[k] = look(k);
     for (int k = 0; k < n; ++k) {
         float sum = 0.0f, whole = 0.0f;

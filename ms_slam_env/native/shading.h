@@ -1,6 +1,6 @@
-// Colour of what each ray hits along a row of pixels; see shading.py.
+// Colour at each ray hit along a row of pixels; see shading.py.
 //
-// No branch depends on the pixel, so Clang makes vector instructions of the loop.
+// No branch depends on the pixel, so Clang vectorises the loop.
 #pragma once
 
 #include "checked.h"
@@ -21,8 +21,8 @@ void shade_span(
     const auto t_of = VIEW(const float, hits.t, 0, end);
     const auto u_of = VIEW(const float, hits.u, 0, end);
     const auto v_of = VIEW(const float, hits.v, 0, end);
-    const auto uv = VIEW(const float, surfaces.uv, 0, 6 * face_count);  // 6 a face
-    const auto irradiance = VIEW(const float, surfaces.irradiance, 0, 9 * face_count);  // 9 a face
+    const auto uv = VIEW(const float, surfaces.uv, 0, 6 * face_count);  // 6 per face
+    const auto irradiance = VIEW(const float, surfaces.irradiance, 0, 9 * face_count);  // 9 per face
     const auto normal = VIEW(const float, surfaces.normal, 0, 3 * face_count);
     const auto sizes = VIEW(const int, surfaces.sizes, 0, 3 * surfaces.sizes.shape[0]);
     const auto texels = VIEW(const unsigned, surfaces.texels, 0, surfaces.texels.shape[0]);
@@ -30,14 +30,14 @@ void shade_span(
     const float dark = read * read;
     const float dy = ((float)y - camera.cy) / camera.fy;
 
-    const auto log2_of = [](float value) {  // exponent, and the series of atanh for the rest
+    const auto log2_of = [](float value) {  // exponent, and the atanh series for the mantissa
         union {
             float f;
             int i;
         } bits;
         bits.f = value;
         const int exponent
-            = (bits.i - 0x3f3504f3) >> 23;  // the rest is within 1/sqrt(2) and sqrt(2)
+            = (bits.i - 0x3f3504f3) >> 23;  // the mantissa is in [1/sqrt(2), sqrt(2)]
         bits.i -= exponent << 23;
         const float s = (bits.f - 1.0f) / (bits.f + 1.0f);
         const float s2 = s * s;
@@ -68,8 +68,8 @@ void shade_span(
         const float v = v_of[i];
         const float w = 1.0f - u - v;
 
-        // Mip level: the width of the pixel's footprint on the surface, in texels; as without a
-        // lens.
+        // Mip level: the width of the pixel's footprint on the surface, in texels; distortion is
+        // ignored.
         const float dx = ((float)x - camera.cx) / camera.fx;
         const float rx = T.data[0][0] * dx + T.data[0][1] * dy + T.data[0][2];
         const float ry = T.data[1][0] * dx + T.data[1][1] * dy + T.data[1][2];

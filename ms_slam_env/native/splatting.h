@@ -1,9 +1,9 @@
-// Weighted sums of splats to images; see splatting.py.
+// Resolves weighted sums of splats to images; see splatting.py.
 #pragma once
 
 #include "checked.h"
 
-// Resolve the row of pixels from `first` on, on which the rays have `y` at z = 1.
+// Resolve the row of pixels that starts at `first`; its rays have `y` at z = 1.
 void resolve_row(
     const auto& sums, const auto& camera, float y, int first, const auto& vertices,
     const auto& normals, const auto& intensity, const auto& color) {

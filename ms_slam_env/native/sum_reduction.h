@@ -1,11 +1,11 @@
-// Sums over the pieces of a pass; see solver.py.
+// Sums over the parts of a pass; see solver.py.
 #pragma once
 
 #include "checked.h"
 
 GIVEN(int, SUMS);
 
-// The same for all of them, several at a time.
+// Add up all sums of a hypothesis over the slots, several at a time.
 void reduce_all_sums(const auto& hypotheses, int slots, int b, int k) {
     const size_t which = size_t(b) * hypotheses.sums.shape[1] + k;
     auto partial = VIEW(

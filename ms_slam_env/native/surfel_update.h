@@ -6,7 +6,7 @@
 GIVEN(float, STEEPEST);
 GIVEN(float, COARSER);
 
-// Update the listed surfels from `first` on, at most to `end`; how many those were.
+// Update the listed surfels from `first` on, at most to `end`; return their number.
 int update_some(
     const auto& surfels, const auto& visible, int b, int first, int end, const auto& camera,
     const auto& parameters, const auto& frame) {
@@ -36,8 +36,8 @@ int update_some(
     const auto N = VIEW(const float, visible.normal, 3 * listed, 3 * n);
     const auto index = VIEW(const int, visible.index, listed, n);
 
-    // Where the surfels are in the image, and the plane of each: a reading at depth z is z (x, y,
-    // 1), its distance along n is z n . (x, y, 1) - n . p = z slope - offset.
+    // Image positions and planes of the surfels: a reading at depth z is z (x, y, 1), and its
+    // distance along n is z n . (x, y, 1) - n . p = z slope - offset.
     int pixel[LANES];
     float right[LANES], down[LANES], tolerance[LANES], offset[LANES], slope[LANES];
     const float per_fx = 1.0f / fx, per_fy = 1.0f / fy;
@@ -63,7 +63,7 @@ int update_some(
     }
 
 #if !defined(__CUDA_ARCH__) && !defined(MS_SLAM_CHECKED)
-    for (int k = 0; k < n; ++k) {  // what is needed further down is fetched meanwhile
+    for (int k = 0; k < n; ++k) {  // prefetch what is needed later
         const float* color = colors + 3 * size_t(pixel[k]);
         const float* normal = live_normals + 3 * size_t(pixel[k]);
         __builtin_prefetch(color);
@@ -73,7 +73,7 @@ int update_some(
     }
 #endif
 
-    // The four readings around; those of the surfel's surface get their bilinear weight, others 0.
+    // The four surrounding readings: bilinear weight on the surfel's surface, otherwise 0.
     float w00[LANES], w01[LANES], w10[LANES], w11[LANES];
     SINGLE_LOADS
     for (int k = 0; k < n; ++k) {
@@ -132,7 +132,7 @@ int update_some(
 #endif
     }
 
-    // What the frame and the map hold there.
+    // Values of the frame and of the map.
     float alpha[LANES], confidence[LANES], radius[LANES];
     int moving[LANES];
     float lx[LANES], ly[LANES], lz[LANES], red[LANES], green[LANES], blue[LANES];
@@ -177,7 +177,7 @@ int update_some(
 #endif
     }
 
-    // The average; confidence is the weight of the past.
+    // The weighted average; confidence is the weight of earlier readings.
     float px[LANES], py[LANES], pz[LANES], nx[LANES], ny[LANES], nz[LANES];
     int matched[LANES], refined[LANES];
     for (int k = 0; k < n; ++k) {

@@ -1,4 +1,4 @@
-"""Charts as data: drawn as PNG by ``figures`` and, interactive, by the page of a report."""
+"""Charts as data: ``figures`` draws them as PNG, a report page as interactive plots."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ Point = float | int | str | None
 
 @dataclass(frozen=True)
 class Series:
-    """Points of one name.
+    """A named series of points.
 
     Attributes:
-        name: in the legend; series of one name in several panels look alike.
+        name: legend entry; series of the same name look alike in all panels.
         x: (n,) numbers in the metric's stored unit, or names of categories.
-        y: (n,) the same.
-        low: (n,) lower ends of an interval around ``y`` (around ``x`` where ``y`` are names).
+        y: (n,) likewise.
+        low: (n,) lower ends of an interval around ``y`` (around ``x`` if ``y`` holds names).
         high: (n,) upper ends.
         mode: ``lines``, ``markers``, ``lines+markers``, ``bars``; ``dots`` are small and pale,
-            ``dashes`` a broken line of no colour, such as a truth.
-        text: (n,) what each point is, shown on pointing at it.
+            ``dashes`` a dashed line without colour, for a reference such as the truth.
+        text: (n,) description of each point, shown on hover.
     """
 
     name: str
@@ -43,10 +43,10 @@ class Series:
     text: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        """Refuse unknown modes and columns of different length.
+        """Refuse unknown modes and columns of different lengths.
 
         Raises:
-            InputError: naming the series.
+            InputError: one of these; the message names the series.
         """
         if self.mode not in MODES:
             raise unknown("mode of a series", self.mode, MODES)
@@ -59,12 +59,12 @@ class Series:
 
 @dataclass(frozen=True)
 class Guide:
-    """A straight dashed line, a target for example.
+    """A straight dashed line, for example at a target.
 
     Attributes:
-        value: where it crosses its axis, stored unit.
-        axis: that it crosses, ``x`` or ``y``.
-        name: in the legend; empty: none.
+        value: position on its axis, in the stored unit.
+        axis: axis that it crosses, ``x`` or ``y``.
+        name: legend entry; none if empty.
     """
 
     value: float
@@ -75,7 +75,7 @@ class Guide:
         """Refuse unknown axes.
 
         Raises:
-            InputError: listing the axes.
+            InputError: unknown axis; the message lists the valid ones.
         """
         if self.axis not in ("x", "y"):
             raise unknown("axis of a guide", self.axis, ("x", "y"))
@@ -86,13 +86,13 @@ class Panel:
     """One drawing with two axes.
 
     Attributes:
-        x: key of the metric on the x axis; empty: categories.
-        y: key of the metric on the y axis; empty: categories.
-        series: what is drawn.
-        log: axes that are logarithmic: ``""``, ``x``, ``y`` or ``xy``.
-        guides: straight lines.
-        title: above it.
-        equal: whether both axes have one scale, for plans.
+        x: key of the metric on the x axis; empty for categories.
+        y: key of the metric on the y axis; empty for categories.
+        series: series to draw.
+        log: logarithmic axes: ``""``, ``x``, ``y`` or ``xy``.
+        guides: straight lines to draw.
+        title: title above the panel.
+        equal: whether both axes have the same scale, as in a floor plan.
     """
 
     x: str
@@ -118,9 +118,9 @@ class Chart:
     """Panels side by side; a page shows one at a time.
 
     Attributes:
-        name: of the PNG file, without its ending.
-        title: above it.
-        caption: what the marks are.
+        name: name of the PNG file, without extension.
+        title: title above the chart.
+        caption: explanation of the marks.
         panels: from left to right, in rows of four.
     """
 
@@ -130,16 +130,16 @@ class Chart:
     panels: Sequence[Panel]
 
     def as_json(self) -> dict[str, Any]:
-        """The chart as JSON's types."""
+        """The chart as plain JSON types."""
         return asdict(self)
 
 
 def chart_from_json(content: Mapping[str, Any]) -> Chart:
-    """The chart that :meth:`Chart.as_json` wrote.
+    """Rebuild a chart from the output of :meth:`Chart.as_json`.
 
     Raises:
         InputError: a key that the registry does not know.
-        KeyError, TypeError: content of another form.
+        KeyError, TypeError: malformed content.
     """
     panels = [
         build(
@@ -177,13 +177,13 @@ def over_field(
     """A panel for each metric of ``keys``: its median and interval over a field of the specs.
 
     Args:
-        rows: of an experiment.
-        field: of the specifications, on the x axis.
+        rows: rows of an experiment.
+        field: field of the specs on the x axis.
         keys: metrics on the y axes.
-        by: field whose values have a line each; empty: one line.
-        x: key of the metric that the field is; empty: ``field`` itself.
-        log: keys that are drawn on a logarithmic axis.
-        label: name of a line from the value of ``by``.
+        by: field with one line per value; a single line if empty.
+        x: metric key of the field, if it differs from ``field``.
+        log: keys to draw on a logarithmic axis.
+        label: turns a value of ``by`` into the name of its line.
     """
     cells = grouped(rows, (by, field) if by else (field,))
     names = dict.fromkeys(group[0] if by else "" for group in cells)
@@ -210,12 +210,12 @@ def by_group(
     """A panel for each metric: every row as a dot and each group's median with its interval.
 
     Args:
-        rows: of an experiment.
-        by: field of the specifications that groups them.
+        rows: rows of an experiment.
+        by: field of the specs that groups the rows.
         keys: metrics on the x axes.
-        log: keys that are drawn on a logarithmic axis.
-        order: of the groups, from the top; those not named follow.
-        label: name of a group from the value of ``by``.
+        log: keys to draw on a logarithmic axis.
+        order: groups from the top; other groups follow.
+        label: turns a value of ``by`` into the name of its group.
     """
     cells = {group[0]: results for group, results in grouped(rows, (by,)).items()}
     names = [*(name for name in order if name in cells), *(n for n in cells if n not in order)]
@@ -240,14 +240,14 @@ def by_group(
 def bars(
     rows: Sequence[Row], field: str, by: str, keys: Iterable[str], label: Callable[[Any], str] = str
 ) -> list[Panel]:
-    """A panel for each metric: its median, of flags the share, with its interval as a bar.
+    """A panel for each metric, with bars for its median (share for flags) and its interval.
 
     Args:
-        rows: of an experiment.
-        field: of the specifications, whose values stand along the x axis.
-        by: field whose values have a colour each.
+        rows: rows of an experiment.
+        field: field of the specs whose values are on the x axis.
+        by: field with one colour per value.
         keys: metrics on the y axes.
-        label: name of a colour from the value of ``by``.
+        label: turns a value of ``by`` into its legend entry.
     """
     cells = grouped(rows, (by, field))
     places = list(dict.fromkeys(place for _, place in cells))
@@ -278,7 +278,7 @@ def scatter(
     floor: float = 0.0,
     label: Callable[[Any], str] = str,
 ) -> Panel:
-    """Each row as a mark, one series a value of field ``by``; ``floor``: smallest x drawn."""
+    """Each row as a mark, one series per value of field ``by``; ``floor``: smallest x drawn."""
     series = []
     for name in dict.fromkeys(row["spec"][by] for row in finished(rows)):
         own = [row for row in finished(rows) if row["spec"][by] == name]
@@ -297,9 +297,9 @@ def scatter(
 
 
 def without_long_tail(lines: Sequence[Series], times: float = 2.0) -> list[Series]:
-    """Lines, the longest cut to the end of the next where it is more than so many times as long.
+    """Lines with the longest cut to the length of the next, if more than ``times`` as long.
 
-    One run that goes on long after all others would leave these a strip of the chart.
+    Otherwise one very long run would compress all others into a narrow strip of the chart.
     """
     ends = sorted(len(line.x) for line in lines)
     if len(ends) < 2 or ends[-1] <= times * ends[-2]:
@@ -322,7 +322,7 @@ def without_long_tail(lines: Sequence[Series], times: float = 2.0) -> list[Serie
 def quartile_bands(
     x: str, y: str, bands: Sequence[Series], log: str = ""
 ) -> tuple[str, list[Panel]]:
-    """Caption and panel of metric ``y`` over ``x``, of lines as `quartile_band` makes them."""
+    """Caption and panel of metric ``y`` over ``x``, from lines made by `quartile_band`."""
     cut = without_long_tail(bands)
     caption = "Line: median over episodes; band: between their quartiles."
     caption += "" if cut == list(bands) else " One goes on, cut here."
@@ -332,9 +332,9 @@ def quartile_bands(
 def quartile_band(
     name: str, steps: Sequence[float], runs: Sequence[Sequence[float]], floor: float = 0.0
 ) -> Series:
-    """Median over runs at each step and its quartiles; one that ends early keeps its last value.
+    """Median and quartiles over runs at each step; a run that ends early keeps its last value.
 
-    ``steps`` are those of the values of the longest run.
+    ``steps`` are those of the longest run.
     """
     length = max(map(len, runs))
     padded = np.array([[*run, *[run[-1]] * (length - len(run))] for run in runs])

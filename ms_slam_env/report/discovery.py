@@ -1,4 +1,4 @@
-"""Results in a folder and below, each with the pictures and texts that lie beside it."""
+"""Find results in a folder tree, each with the pictures and texts next to it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".
 _TEXTS = (".yaml", ".yml", ".md", ".txt", ".csv")
 MAX_PICTURE_BYTES = 4_000_000
 MAX_TEXT_BYTES = 100_000
-_MAX_PICTURES_BYTES = 100_000_000  # of one folder: the page is one file in memory
+_MAX_PICTURES_BYTES = 100_000_000  # per folder, since the page is built in memory
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,12 @@ class FoundResult:
     """A result file and its neighbours.
 
     Attributes:
-        path: of the file.
-        title: its folder from the top one on, with the file where the folder has several.
-        results: what it holds.
-        pictures: picture files that belong to it, without those drawn from its charts.
-        texts: text files that belong to it, without its tables in Markdown.
+        path: the result file.
+        title: its folder relative to the top folder, plus the file name if the folder holds
+            several results.
+        results: content of the file.
+        pictures: picture files that belong to it, except those drawn from its charts.
+        texts: text files that belong to it, except its Markdown tables.
     """
 
     path: Path
@@ -37,19 +38,19 @@ class FoundResult:
 
 @dataclass(frozen=True)
 class NotShown:
-    """A file that is not shown, by its name from the top folder on, and why."""
+    """A file that is not shown, by its path from the top folder, and the reason."""
 
     name: str
     reason: str
 
 
 def find_results(folder: Path) -> tuple[list[FoundResult], list[NotShown]]:
-    """The results, by path, and the files that are no results or too large.
+    """Find the results, sorted by path, and the files that are not results or are too large.
 
-    Hidden files and links that lead out of the folder are passed over.
+    Skips hidden files and links that lead out of the folder.
 
     Raises:
-        InputError: no such folder, no result in it.
+        InputError: no such folder, or no result in it.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder")
@@ -86,7 +87,7 @@ def find_results(folder: Path) -> tuple[list[FoundResult], list[NotShown]]:
 
 
 def _records(paths: Sequence[Path]) -> list[Path]:
-    """The JSON files, and the compressed ones whose content is not beside them."""
+    """The JSON files, and the compressed ones without an uncompressed copy."""
     plain = [path for path in paths if path.suffix == ".json"]
     packed = [path for path in paths if path.name.endswith(f".json{PACKED}")]
     return plain + [path for path in packed if path.with_suffix("") not in plain]
@@ -99,7 +100,7 @@ def _stem(path: Path) -> str:
 def _neighbours(
     results: Mapping[Path, Results], paths: Sequence[Path]
 ) -> dict[Path, tuple[list[Path], list[Path], list[Path]]]:
-    """Pictures, texts, and those too large, of each result: those whose names are most alike."""
+    """Pictures, texts and oversized files of each result, assigned by similarity of names."""
     found: dict[Path, tuple[list[Path], list[Path], list[Path]]]
     found = {path: ([], [], []) for path in results}
     drawn = {chart.name for result in results.values() for chart in result.charts}
@@ -120,5 +121,5 @@ def _neighbours(
 
 
 def _likeness(result: str, other: str) -> int:
-    """How many words, parted by underscores, the two names have in common."""
+    """Number of words, separated by underscores, that the two names have in common."""
     return len(set(result.split("_")) & set(other.split("_")))

@@ -1,4 +1,4 @@
-"""Charts as PNG files, and what hand-drawn figures share; needs no display."""
+"""Draw charts as PNG files, without a display; helpers for other figures."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _LOOKS: dict[str, dict[str, Any]] = {
     "dots": {"linestyle": "", "marker": ".", "markersize": 5, "alpha": 0.35},
 }
 _COLUMNS = 4
-_LONG_NAME = 30  # letters; legends of longer ones would leave the panels no room beside them
+_LONG_NAME = 30  # letters; a legend with longer names would leave no room for the panels
 
 
-@matplotlib.rc_context({"text.parse_math": False})  # a dollar in a name is a dollar
+@matplotlib.rc_context({"text.parse_math": False})  # a dollar sign is not markup
 def save_charts(charts: Iterable[Chart], out: Path) -> list[Path]:
     """Draw each chart into folder ``out`` under its name; return the paths."""
     return [save(draw(chart), out / f"{chart.name}.png") for chart in charts]
@@ -42,7 +42,7 @@ def draw(chart: Chart) -> Figure:
     names = list(dict.fromkeys(s.name for panel in chart.panels for s in panel.series))
     categories = {str(y) for p in chart.panels if not p.y for s in p.series for y in s.y}
     longest = max(map(len, categories), default=0)
-    width = 5.2 if len(chart.panels) == 1 else 3.4  # one panel shares its width with the legend
+    width = 5.2 if len(chart.panels) == 1 else 3.4  # a single one holds the legend, too
     columns = min(len(chart.panels), _COLUMNS)
     rows = -(-len(chart.panels) // _COLUMNS)
     figure = new_figure(
@@ -115,12 +115,12 @@ def _draw_series(
     else:
         look = {"color": color, **_LOOKS[series.mode]}
         if series.mode.startswith("lines"):
-            again = names.index(series.name) // len(_PALETTE)  # how often colours have come before
+            again = names.index(series.name) // len(_PALETTE)  # times that all colours were used
             look["linestyle"] = _DASHES[again % len(_DASHES)]
         ax.plot(x, y, label=None if series.mode == "dots" else label, **look)
     if not series.low:
         return
-    is_flat = not panel.y  # categories on the y axis: the interval is along x
+    is_flat = not panel.y  # categories on the y axis, so the interval is along x
     key, middle = (panel.x, x) if is_flat else (panel.y, y)
     low, high = _scaled(series.low, key), _scaled(series.high, key)
     if series.mode.startswith("lines"):
@@ -136,26 +136,26 @@ def _scale(key: str) -> float:
 
 
 def _scaled(values: Sequence[Any], key: str) -> list[Any]:
-    """Values in the shown unit; names of categories as text."""
+    """Values in the shown unit, or category names as text."""
     if not key or any(isinstance(value, str) for value in values):
         return [str(value) for value in values]
     return [np.nan if value is None else value * _scale(key) for value in values]
 
 
 def new_figure(columns: int = 1, width: float = 3.4, height: float = 3.2) -> Figure:
-    """An empty figure for ``columns`` panels; needs no display."""
+    """An empty figure for ``columns`` panels, without a display."""
     return Figure(figsize=(width * columns, height), layout="constrained")
 
 
 def caption(figure: Figure, text: str) -> None:
-    """Say above the panels what the marks are."""
+    """Explain the marks above the panels."""
     figure.suptitle(text, x=0.01, horizontalalignment="left", fontsize="small")
 
 
 def plain_log_ticks(axis: Axis) -> None:
-    """Label a logarithmic axis, once its data are drawn, with few plain numbers that do not touch.
+    """Label a logarithmic axis, after drawing its data, with a few plain, non-overlapping numbers.
 
-    Matplotlib's own labels, 2 x 10^0 and the like, overlap where an axis is narrow.
+    Matplotlib's default labels, such as 2 x 10^0, overlap on a narrow axis.
     """
     low, high = axis.get_view_interval()
     decades = np.log10(high / low)
@@ -168,7 +168,7 @@ def plain_log_ticks(axis: Axis) -> None:
 
 
 def save(figure: Figure, path: Path, dpi: int = 120) -> Path:
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as PNG, atomically."""
     picture = io.BytesIO()
     figure.savefig(picture, dpi=dpi, format="png")
     write_bytes(path, picture.getvalue())
@@ -176,5 +176,5 @@ def save(figure: Figure, path: Path, dpi: int = 120) -> Path:
 
 
 def colour(index: int) -> str:
-    """One colour a series, distinguishable with common colour-vision deficiencies."""
+    """Colour of a series, distinguishable with common colour-vision deficiencies."""
     return matplotlib.colors.to_hex(_PALETTE[index % len(_PALETTE)])

@@ -1,21 +1,27 @@
-"""Tables of Markdown pages, written from committed results so that no page says something else.
+"""Write the tables of Markdown pages from committed results, so that pages and results agree.
 
-Between two comments, each on a line of its own, stands what a result says::
+A table stands between two comments, each on a separate line::
 
     <!-- results: planners table=0 columns=planner,ate_m,f_score_5cm -->
     <!-- end -->
 
 The first word is a folder of results, whose ``results.json`` is read, or a JSON file in one,
-compressed or not. The options: ``table``, number or title of a table (by default the first);
-``columns``, their names (by default all); ``where``, a column and the texts that it may have, as in
-``where=planner=a|b``; ``rows``, at most so many of the first; ``made_by=yes``, the command in a
-line below.
-Where the result is older than the code, or made from an uncommitted state of it, the first of its
-tables on the page says so above.
+compressed or not. Options:
 
-After ``agents:`` in place of ``results:`` stand policy files or folders of them, from the root of
-the clone on; what follows are their model cards. After ``leaders:`` stand folders of results of the
-planner benchmark and ``by=METRIC``; what follows says which planner leads each, and by how much.
+- ``table``: number or title of a table; by default the first.
+- ``columns``: names of the columns; by default all.
+- ``where``: a column and its allowed texts, as in ``where=planner=a|b``.
+- ``rows``: largest number of rows.
+- ``made_by=yes``: add a line with the command.
+
+If the result is older than the code, or was made with code that is in no commit, a warning stands
+above the first of its tables on the page.
+
+With ``agents:`` instead of ``results:``, the comment names policy files or folders of them,
+relative to the root of the clone, and their model cards follow.
+
+With ``leaders:``, the comment names folders of results of the planner benchmark and ``by=METRIC``.
+The table says which planner leads each benchmark, and by how much.
 """
 
 from __future__ import annotations
@@ -41,7 +47,7 @@ _OPTIONS = ("table", "columns", "where", "rows", "made_by")
 
 
 Mark = Callable[[Table], Table]
-"""Adds to a stored table what is known by now of its lines."""
+"""Adds to a stored table what has become known about its lines."""
 
 
 def _unmarked(table: Table) -> Table:
@@ -55,9 +61,9 @@ def update_pages(
 
     Args:
         pages: Markdown files.
-        results: folder of the folders of results.
+        results: folder that contains the folders of results.
         write: whether to change the pages.
-        mark: applied to the tables of results.
+        mark: function applied to each table of results.
 
     Raises:
         InputError: a comment that names no table, or is not closed; the message says where.
@@ -74,14 +80,14 @@ def update_pages(
 
 
 def with_tables(text: str, results: Path, name: str = "page", mark: Mark = _unmarked) -> str:
-    """``text`` with its tables as the results have them, each as ``mark`` returns it.
+    """``text`` with its tables rewritten from the results, each as ``mark`` returns it.
 
     Raises:
         InputError: see :func:`update_pages`.
     """
     lines: list[str] = []
-    warned: set[Path] = set()  # a page says once that a result is out of date
-    opened = 0  # line number of the comment that a table stands below
+    warned: set[Path] = set()  # results whose warning is already on the page
+    opened = 0  # line number of the comment that opens a table
     for number, line in enumerate(text.split("\n"), start=1):
         start = _START.match(line)
         if opened and start:
@@ -110,13 +116,13 @@ def with_tables(text: str, results: Path, name: str = "page", mark: Mark = _unma
 
 
 def _cards(what: str, results: Path, page: Path) -> str:
-    """The cards of the policies that a comment names."""
+    """The model cards of the policies that a comment names."""
     root = results.parent.parent
     return model_cards([root / word for word in _words(what)], results, page).rstrip("\n")
 
 
 def _leaders(what: str, folder: Path, mark: Mark) -> str:
-    """Who leads each of the results that a comment names, by the metric that it names."""
+    """Table of the leader of each result that a comment names, by the named metric."""
     names = _words(what)
     by = [name.removeprefix("by=") for name in names if name.startswith("by=")]
     if len(by) != 1 or len(names) < 2:
@@ -133,9 +139,9 @@ def _words(what: str) -> list[str]:
 
 
 def _inserted(what: str, folder: Path, warned: set[Path], mark: Mark) -> str:
-    """What stands below a comment: a warning where the result is out of date, note and table.
+    """Text below a comment: a warning if the result is out of date, then note and table.
 
-    Results in ``warned`` have their warning further up; this one's is added.
+    Results in ``warned`` already have a warning on the page; a new one is added to it.
     """
     place, *words = _words(what)
     options = dict(word.partition("=")[::2] for word in words)
@@ -155,13 +161,13 @@ def _inserted(what: str, folder: Path, warned: set[Path], mark: Mark) -> str:
 
 
 def _wrapped(line: str) -> str:
-    """A line of a note on lines of at most 100 characters; rows of tables stay as they are."""
+    """Wrap a line of a note to at most 100 characters; rows of tables are not changed."""
     is_row = line.startswith("|")
     return line if is_row else textwrap.fill(line, 100, break_long_words=False)
 
 
 def _chosen(results: Results, which: str) -> Table:
-    """The table of that number or title."""
+    """The table with this number or title."""
     tables = {str(n): table for n, table in enumerate(results.tables)}
     tables |= {table.title: table for table in results.tables if table.title}
     if which not in tables:
@@ -170,7 +176,7 @@ def _chosen(results: Results, which: str) -> Table:
 
 
 def _cut(table: Table, options: dict[str, str]) -> Table:
-    """The columns and rows that are asked for, without title: the page has its own headings."""
+    """The requested columns and rows, without title, since the page has headings."""
     columns = {column.name: column for column in table.columns}
     names = options["columns"].split(",") if "columns" in options else list(columns)
     for name in names:

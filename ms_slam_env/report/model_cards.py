@@ -1,9 +1,9 @@
-"""Model cards: what a trained policy is, how it came to be, what it scores, and where it ends.
+"""Model cards: description, training, scores and limits of a trained policy.
 
-Made from the text in a policy file and the results that are about it. Of the file nothing but that
-text is read, so neither the trainer's libraries nor the agents are needed. Results are about a
-policy if they are of its training (the same options, and a point after as many steps) or have a
-planner ``agent-NAME`` of the file ``NAME.safetensors``.
+A card is made from the metadata in a policy file and the results about the policy. Only the
+metadata is read, so neither the trainer's libraries nor the agents are needed. Results are about a
+policy if they come from its training (the same options, and a point after as many steps) or contain
+the planner ``agent-NAME`` for the file ``NAME.safetensors``.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from ms_slam_env.scenes import SEED_SPLITS, seeds_of, split_of
 SUFFIX = ".safetensors"
 _TEXT = "ms_slam_policy"
 _LARGEST_HEADER = 1_000_000  # bytes
-_NO_MATTER = ("out", "resume", "num_envs", "eval_episodes")  # make no other training
-_MORE_OF_IT = ("rounds", "total_timesteps", "minutes")  # a policy may be taken before its end
+_NO_MATTER = ("out", "resume", "num_envs", "eval_episodes")  # do not change the training
+_MORE_OF_IT = ("rounds", "total_timesteps", "minutes")  # a policy may be saved before the end
 _SCORES = (
     *("planner", "episodes", "f_score_5cm", "f_score_5cm_area", "ate_m", "lost"),
     *("not_recovered_share", "violations", "decision_ms"),
@@ -37,22 +37,22 @@ _VERDICTS = (
     (PAIRS["f_score_5cm_area"], "f_score_5cm_area", "area under F-score"),
     (PAIRS["return"], "return", "return"),
 )
-"""A table of probabilities, by what the best classical planner is chosen, and what it is."""
+"""Title of a table of probabilities, metric that selects the best classical planner, its name."""
 _NO_RIVALS = (
     "agent-",
     "policy",
     "oracle",
     "foresight",
-)  # planners that were trained, or know the scene
+)  # trained planners, or those that know the scene
 
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy file by what it says of itself.
+    """A policy file and its metadata.
 
     Attributes:
-        path: of the file.
-        known: its metadata, as ``agents/policy_file.py`` describes them.
+        path: the file.
+        known: its metadata, which ``agents/policy_file.py`` describes.
     """
 
     path: Path
@@ -60,32 +60,32 @@ class Policy:
 
     @property
     def planner(self) -> str:
-        """The name that it is benchmarked by."""
+        """Name of the policy in benchmarks."""
         return f"agent-{self.path.stem}"
 
     @property
     def options(self) -> Mapping[str, Any]:
-        """Of its training."""
+        """Options of its training."""
         return dict(self.known.get("options") or {})
 
     def is_trained_as(self, one: FoundResult, but_for: Sequence[str] = ()) -> bool:
-        """Whether a result is of a training with the same options, but for some."""
+        """Whether a result comes from a training with the same options, except ``but_for``."""
         config = _config(one)
         own = {k: v for k, v in self.options.items() if k not in (*_NO_MATTER, *but_for)}
         same = all(config.get(key) == value for key, value in own.items())
         return one.results.kind == "train" and bool(own) and same
 
     def is_trained_in(self, one: FoundResult) -> bool:
-        """Whether a training run led to it."""
+        """Whether a result is the training run that produced this policy."""
         steps = [(row["result"] or {}).get("timesteps") for row in one.results.rows]
         return self.is_trained_as(one, _MORE_OF_IT) and self.known["timesteps"] in steps
 
 
 def read_policy_text(path: Path) -> Policy:
-    """What a policy file says of itself, without its numbers.
+    """Read the metadata of a policy file, without its weights.
 
     Raises:
-        InputError: no policy file.
+        InputError: not a policy file.
     """
     try:
         with path.open("rb") as file:
@@ -104,11 +104,11 @@ def model_cards(paths: Sequence[Path], results: Path, page: Path) -> str:
 
     Args:
         paths: policy files, or folders of them.
-        results: folder of the folders of results.
-        page: where the cards stand, which links are from.
+        results: folder that contains the folders of results.
+        page: page with the cards, which links are relative to.
 
     Raises:
-        InputError: a path that is no policy file, or a folder without one.
+        InputError: a path that is not a policy file, or a folder without one.
     """
     found, _ = find_results(results)
     return "\n".join(_card(policy, found, page) for policy in map(read_policy_text, _files(paths)))
@@ -131,7 +131,7 @@ def _card(policy: Policy, found: Sequence[FoundResult], page: Path) -> str:
     trainings = [one for one in found if policy.is_trained_in(one)]
     benchmarks = [one for one in found if one.results.kind == "planners" and _scores(one, policy)]
     parts = [f"## `{policy.planner}`\n", _facts(policy), _command(policy.known)]
-    scores: dict[str, _Score] = {}  # by task, those that say most
+    scores: dict[str, _Score] = {}  # by task, those with the most evidence
     for score in (score for one in benchmarks for score in _scores(one, policy)):
         known = scores.get(score.task)
         if known is None or score.weight > known.weight:
@@ -151,7 +151,7 @@ def _card(policy: Policy, found: Sequence[FoundResult], page: Path) -> str:
     return "\n".join(parts)
 
 
-# -- What it is ------------------------------------------------------------------------------------
+# -- Description -----------------------------------------------------------------------------------
 
 
 def _facts(policy: Policy) -> str:
@@ -195,7 +195,7 @@ def _command(known: Mapping[str, Any]) -> str:
     return f"```sh\n{made.get('command', '')}\n```\n\n{where}\n"
 
 
-# -- What it scores --------------------------------------------------------------------------------
+# -- Scores ----------------------------------------------------------------------------------------
 
 
 def _is_of(policy: Policy, planner: Any) -> bool:
@@ -206,7 +206,7 @@ def _is_of(policy: Policy, planner: Any) -> bool:
 
 @dataclass(frozen=True)
 class _Score:
-    """What a policy reached in one task: its line of a table, and those of classical planners."""
+    """Scores of a policy in one task: its table row, and those of classical planners."""
 
     one: FoundResult
     table: Table
@@ -219,12 +219,12 @@ class _Score:
 
     @property
     def weight(self) -> tuple[int, int]:
-        """Episodes, and among how many rivals."""
+        """Number of episodes, and number of rivals."""
         return int(self.own.get("episodes", 0)), len(self.others)
 
 
 def _scores(one: FoundResult, policy: Policy) -> list[_Score]:
-    """The tables over all scenes that have the policy; benchmarks rank their lines, best first."""
+    """Tables over all scenes that contain the policy; benchmarks rank their rows, best first."""
     scores = []
     for k, table in enumerate(one.results.tables):
         own = [row for row in table.rows if _is_of(policy, row.get("planner"))]
@@ -264,7 +264,7 @@ def _task(one: FoundResult, table: Table) -> str:
 
 
 def _best_rival(score: _Score, metric: str, table: Table) -> Any:
-    """The classical planner with the largest value; where none is known, the table's first one."""
+    """The classical planner with the largest value; if none is known, the table's first one."""
     known = [line for line in score.others if isinstance(line.get(metric), Interval)]
     if known:
         return max(known, key=lambda line: line[metric].value)["planner"]
@@ -289,11 +289,11 @@ def _verdict(chance: Interval, rival: str) -> str:
     return f"no difference from {rival}, is shown"
 
 
-# -- Where it ends ---------------------------------------------------------------------------------
+# -- Limits ----------------------------------------------------------------------------------------
 
 
 def _may_be_of_training(benchmark: FoundResult) -> bool:
-    """Whether a benchmark was on a seed that trainings draw."""
+    """Whether a benchmark used a seed that trainings draw from."""
     try:
         seeds = seeds_of(_config(benchmark).get("seeds", "test"))
     except InputError:
@@ -313,7 +313,7 @@ def _limits(
     rows = [row for one in benchmarks for row in one.results.rows]
     met = {row["spec"].get("scene") for row in rows if _is_of(policy, row["spec"].get("planner"))}
     new = sorted(str(name) for name in met - set(options.get("scenes") or ()))
-    if options.get("scenes") and new and not options.get("also"):  # whose scenes it does not say
+    if options.get("scenes") and new and not options.get("also"):  # its scenes are not recorded
         yield f"- It is scored in scenes that it was not trained in: {', '.join(new)}."
     if benchmarks and not any(map(_may_be_of_training, benchmarks)):
         yield "- All scores are on seeds that it was not trained on."
@@ -333,7 +333,7 @@ def _limits(
 
 
 def _training(one: FoundResult, page: Path) -> Iterator[str]:
-    """The training curve as figures; where there is none, as a table."""
+    """The training curve as figures, or as a table if there are none."""
     yield "### Training curve\n"
     figures = [(chart, one.path.with_name(f"{chart.name}.png")) for chart in one.results.charts]
     shown = [(chart, figure) for chart, figure in figures if figure.is_file()]

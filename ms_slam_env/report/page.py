@@ -1,4 +1,4 @@
-"""A folder of results as one HTML page: style, script, Plotly and data in it, nothing loaded."""
+"""Write a folder of results as one self-contained HTML page, with style, scripts and data."""
 
 from __future__ import annotations
 
@@ -35,29 +35,29 @@ from ms_slam_env.report.tables import Table, Value, format_value
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; "
     "img-src data: blob:; base-uri 'none'; form-action 'none'"
-)  # a browser that reads it loads nothing, whatever a result holds
+)  # keeps the browser from loading anything, whatever a result contains
 _PROVENANCE = ("command", "time", "commit", "python", "versions", "platform", "cpu", "gpu")
 _MAX_CONTENT = 100_000
 
 
 def escape(text: str) -> str:
-    """Text for the page, its letters in their order."""
+    """Escape text for the page, without characters that reorder letters."""
     return html_escape(in_order(text))
 
 
 def write_report(folder: Path, out: Path | None = None) -> Path:
-    """One self-contained page of every result in ``folder`` and below, written whole or not at all.
+    """Write one self-contained page with every result in ``folder`` and below, atomically.
 
     Args:
-        folder: of results of any of the commands and experiments.
+        folder: results of any commands and experiments.
         out: the page; by default ``report.html`` in ``folder``.
 
     Returns:
         path of the page.
 
     Raises:
-        InputError: no such folder, no result in it, Plotly not installed, or ``out`` is no place
-            for a file.
+        InputError: no such folder, no result in it, Plotly not installed, or ``out`` cannot be a
+            file.
     """
     target = folder / "report.html" if out is None else out
     check_out_file(target)
@@ -67,7 +67,7 @@ def write_report(folder: Path, out: Path | None = None) -> Path:
 
 
 def page(name: str, found: Sequence[FoundResult], absent: Sequence[NotShown] = ()) -> str:
-    """The whole page.
+    """HTML of the whole page.
 
     Raises:
         InputError: Plotly is not installed.
@@ -116,7 +116,7 @@ def _asset(name: str) -> str:
 
 
 def _plotly_source() -> str:
-    """Plotly's library for browsers.
+    """Source of Plotly's browser library.
 
     Raises:
         InputError: Plotly is not installed.
@@ -151,7 +151,7 @@ def _not_shown(absent: Sequence[NotShown]) -> str:
 
 
 def _section(found: FoundResult, anchor: str, is_alone: bool) -> str:
-    """Charts, tables and what lies beside them; alone, the page has the folder's name above."""
+    """Section of a result: charts, tables and neighbouring files; ``is_alone``: the only one."""
     results = found.results
     kind = results.title or results.kind
     title = kind if is_alone else found.title
@@ -216,7 +216,7 @@ def _sortable(
     note: str = "",
     meanings: str = "",
 ) -> str:
-    """A table that scrolls within the page; its cells are HTML already."""
+    """A sortable table that scrolls within the page; its cells are already HTML."""
     heads = "".join(
         f'<th scope="col" aria-sort="none"><button type="button">{escape(heading)}</button></th>'
         for heading in headings
@@ -232,7 +232,7 @@ def _sortable(
 
 
 def _cell(value: Value, key: str) -> str:
-    """A cell, sorted by its number where it has one."""
+    """A table cell, sorted by its number if it has one."""
     number = value.value if isinstance(value, Interval) else value
     mark = ""
     if isinstance(number, (int, float)) and not math.isnan(number):
@@ -240,13 +240,13 @@ def _cell(value: Value, key: str) -> str:
         sign = "-" if shown < 0 else ""
         mark = f' class="n" data-n="{f"{sign}Infinity" if math.isinf(shown) else repr(shown)}"'
     text = escape(format_value(value, key))
-    if isinstance(value, Interval):  # the interval may stand below its value
+    if isinstance(value, Interval):  # the interval may wrap below its value
         text = f"<span>{text.replace(' [', '</span> <span>[')}</span>"
     return f"<td{mark}>{text}</td>"
 
 
 def _meanings(table: Table) -> str:
-    """What each metric of the table is; columns of one metric share an entry."""
+    """Explanation of each metric in the table; columns of the same metric share an entry."""
     headings: dict[str, list[str]] = {}
     for column in table.columns:
         headings.setdefault(column.key or column.name, []).append(column.label)
@@ -262,9 +262,9 @@ def _meanings(table: Table) -> str:
 
 
 def _rows(results: Results, anchor: str) -> str:
-    """Every row of an experiment, on demand: what it was given, what came out, what failed.
+    """Collapsible table of every row of an experiment: inputs, results, errors.
 
-    Series are left out, and what every row was given alike is said once, above.
+    Series are left out, and inputs common to all rows are listed once, above the table.
     """
     lines = [
         {
@@ -306,7 +306,7 @@ def _never_changes(lines: Sequence[Mapping[Any, Any]], name: tuple[str, str]) ->
 
 
 def _is_metric(key: str) -> bool:
-    """Whether the registry explains ``key``; a setting that is no metric is called as it is."""
+    """Whether the registry explains ``key``; other settings are shown by their plain name."""
     try:
         metric(key)
     except InputError:
@@ -342,7 +342,7 @@ def _pictures(paths: Sequence[Path]) -> str:
 
 
 def _provenance(provenance: Mapping[str, Any]) -> str:
-    """Label and text of what made a result."""
+    """Summary and details of a result's provenance."""
     lines = []
     for key in (*_PROVENANCE, *(key for key in provenance if key not in _PROVENANCE)):
         value = provenance.get(key)

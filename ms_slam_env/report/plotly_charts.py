@@ -1,4 +1,4 @@
-"""Charts as Plotly's JSON, one plot a panel; nothing here imports Plotly."""
+"""Convert charts to Plotly's JSON, one plot per panel, without importing Plotly."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PALETTE = (
     "#7d8590",
     "#a26b4a",
 )
-"""Colours of a contrast of 3 and more against white and against the dark page."""
+"""Colours with a contrast of at least 3 against white and against the dark page."""
 _SYMBOLS = ("circle", "square", "diamond", "triangle-up", "cross", "star", "hexagon", "bowtie")
 _DASHES = ("solid", "dash", "dot", "dashdot", "longdash")
 _GUIDE = "#7d8590"
@@ -34,7 +34,7 @@ _OF_EVERY_OBJECT = {
     *("toLocaleString", "toString", "valueOf", "__proto__", "__defineGetter__"),
     *("__defineSetter__", "__lookupGetter__", "__lookupSetter__"),
 }
-"""Names that every object of JavaScript has: as those of a category Plotly takes them for known."""
+"""Property names of every JavaScript object, which Plotly would take for existing categories."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,10 @@ class Plot:
     """One panel.
 
     Attributes:
-        label: of this panel where a chart has several to choose from.
+        label: label of this panel in a chart with several to choose from.
         data: Plotly traces.
-        layout: Plotly layout; colours of text, grid and background come from the page.
-        height_px: that it needs.
+        layout: Plotly layout; the page sets the colours of text, grid and background.
+        height_px: height that the plot needs.
     """
 
     label: str
@@ -55,9 +55,9 @@ class Plot:
 
 
 def plots_of(chart: Chart, beside: Sequence[Chart] = ()) -> list[Plot]:
-    """The panels of a chart; series of one name look alike in all of them.
+    """The panels of a chart; series of the same name look alike in all of them.
 
-    Also in those of the charts ``beside`` it, unless that takes more names than there are colours.
+    They also look alike in the charts ``beside`` it, unless there are more names than colours.
     """
     names = _names(beside or [chart])
     names = names if len(names) <= len(PALETTE) else _names([chart])
@@ -72,23 +72,23 @@ def _names(charts: Sequence[Chart]) -> list[str]:
 
 
 def short(value: Any) -> str:
-    """Text that Plotly shows as it is (it takes some tags for markup), long ones cut inside."""
+    """Text escaped for Plotly (which interprets some tags), with long texts cut in the middle."""
     plain = in_order(" ".join(str(value).split()))
     if len(plain) > _LABEL_LENGTH:
         half = (_LABEL_LENGTH - 1) // 2
         plain = f"{plain[:half]}…{plain[-half:]}"
     if plain in _OF_EVERY_OBJECT:
-        plain = f"\u200b{plain}"  # not the same name, and shown the same
+        plain = f"\u200b{plain}"  # a different name that looks the same
     return html.escape(plain, quote=False)
 
 
 def in_order(text: str) -> str:
-    """Text without what would show its letters in another order."""
+    """Text without the control characters that would reorder its letters."""
     return text.translate(_DIRECTIONS)
 
 
 def _shorts(values: Iterable[str]) -> dict[str, str]:
-    """A short text for each value, different ones for different values."""
+    """A distinct short text for each value."""
     found: dict[str, str] = {}
     for value in dict.fromkeys(values):
         label, count = short(value), 1
@@ -100,7 +100,7 @@ def _shorts(values: Iterable[str]) -> dict[str, str]:
 
 
 def _measure(panel: Panel) -> str:
-    """What the panel is about: the metric on its y axis, on its x axis where y are names."""
+    """Metric of the panel: the one on its y axis, or on its x axis if y holds names."""
     key = panel.y or panel.x
     return metric(key).label if key else ""
 
@@ -133,7 +133,7 @@ def _plot(panel: Panel, names: Sequence[str], label: str) -> Plot:
 
 
 def _categories(panel: Panel, axis: str) -> dict[str, str]:
-    """Names along an axis with their short texts; none where the axis has numbers."""
+    """Names along an axis to their short texts; empty for an axis of numbers."""
     values = [value for series in panel.series for value in getattr(series, axis)]
     if getattr(panel, axis) and not any(isinstance(value, str) for value in values):
         return {}
@@ -154,9 +154,9 @@ def _axis(key: str, categories: list[str]) -> dict[str, Any]:
 
 
 def _logarithmic(panel: Panel, axis: str) -> dict[str, Any]:
-    """A logarithmic axis with few plain numbers: of decades, 1, 2 and 5 in each, or all along.
+    """A logarithmic axis with a few plain numbers: decades; 1, 2 and 5 in each; or evenly spread.
 
-    Without a format Plotly writes 0.05, 0.1, 0.2, 0.5 as 5, 0.1, 2, 5.
+    Without a format, Plotly writes 0.05, 0.1, 0.2, 0.5 as 5, 0.1, 2, 5.
     """
     values = [value for series in panel.series for value in getattr(series, axis)]
     drawn = [value for value in values if value is not None and 0 < value < math.inf]
@@ -192,7 +192,7 @@ def _guides(panel: Panel) -> list[dict[str, Any]]:
 
 
 def _show_in_legend_once(traces: list[dict[str, Any]]) -> None:
-    """One entry a name: of its first trace that is not of pale dots, else of its first."""
+    """One legend entry per name: its first trace that is not pale dots, otherwise its first."""
     for name in {trace["name"] for trace in traces}:
         own = [trace for trace in traces if trace["name"] == name]
         clear = [t for t in own if not t.get("fill") and t.get("opacity", 1) == 1]
@@ -207,7 +207,7 @@ def _traces(
     index: int,
     name: str,
 ) -> list[dict[str, Any]]:
-    """The trace of a series, before it the band of its interval if it has one."""
+    """The trace of a series, preceded by the band of its interval if it has one."""
     colour = PALETTE[index % len(PALETTE)]
     x, y = (_values(getattr(series, a), getattr(panel, a), categories[a]) for a in "xy")
     trace: dict[str, Any] = {"name": name, "legendgroup": name, "x": x, "y": y}
@@ -236,7 +236,7 @@ def _traces(
 
 
 def _values(values: Sequence[Any], key: str, categories: Mapping[str, str]) -> list[Any]:
-    """Names short; numbers in the shown unit, None where they are not finite."""
+    """Short names, or numbers in the shown unit, with None for those that are not finite."""
     if categories:
         return [None if value is None else categories[str(value)] for value in values]
     scale = metric(key).scale if key else 1
@@ -244,7 +244,7 @@ def _values(values: Sequence[Any], key: str, categories: Mapping[str, str]) -> l
 
 
 def _rounded(value: float) -> float | None:
-    """``value`` in 6 digits, which keeps the page small."""
+    """``value`` rounded to 6 digits, which keeps the page small."""
     return float(f"{value:.6g}") if math.isfinite(value) else None
 
 

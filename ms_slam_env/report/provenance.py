@@ -1,4 +1,4 @@
-"""What made a result: command, versions, commit, machine."""
+"""Provenance of a result: command, versions, commit, machine."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PACKAGES = (
 
 
 DIRTY = "-dirty"
-"""What follows a commit whose files were changed."""
+"""Suffix of a commit if its files were changed."""
 
 
 def provenance() -> dict[str, Any]:
@@ -44,11 +44,12 @@ def provenance() -> dict[str, Any]:
 
 
 def git_commit(package: Path = _PACKAGE) -> str | None:
-    """Commit of the checkout that the package's files are in, ``-dirty`` if files differ from it.
+    """Commit of the package's own checkout, with ``-dirty`` if files differ from it.
 
-    None where the package is not tracked: the repository around an environment is the user's. Only
-    what git has recorded is asked, and the files are compared here: ``git status`` would run what
-    the repository configures (file-system monitor, hooks, filters).
+    None if git does not track the package, since a repository around an installed environment is
+    the user's. Git is asked only for recorded objects, and files are compared here, because
+    ``git status`` would run programs that the repository configures (file-system monitor, hooks,
+    filters).
     """
     commit = _git(package, "rev-parse", "--verify", "HEAD")
     listing = _git(package, "ls-tree", "-r", "-z", "HEAD", ".")
@@ -63,7 +64,7 @@ def git_commit(package: Path = _PACKAGE) -> str | None:
 
 
 def _git(folder: Path, *command: str) -> str | None:
-    """What git answers in a folder, of which nothing is run or fetched; None if it fails."""
+    """Output of git in a folder, without running its hooks or fetching; None if it fails."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("GIT_")}
     environment |= {"GIT_NO_LAZY_FETCH": "1", "GIT_OPTIONAL_LOCKS": "0"}
     off = ("core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protocol.allow=never")
@@ -81,7 +82,7 @@ def _git(folder: Path, *command: str) -> str | None:
 
 
 def _is_blob(path: Path, blob: str) -> bool:
-    """Whether a file's content, whatever its line ends, is that of an object of git."""
+    """Whether a file's content, apart from line endings, equals that of a git object."""
     try:
         data = path.read_bytes()
     except OSError:

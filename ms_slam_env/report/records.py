@@ -1,4 +1,4 @@
-"""Finished pieces of work on disk: one JSON line each, safe against interruption at any time."""
+"""Store finished work items on disk, one JSON line each, safe against interruption at any time."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ Row = dict[str, Any]
 T = TypeVar("T")
 
 _MAX_BYTES = 2**30
-_LINE = 100  # characters of JSON that are not broken into lines
+_LINE = 100  # longest JSON, in characters, that stays on one line
 _INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
 _FROM_TEXT = {text: number for number, text in _INFINITE.items()}
 
 
 def spec_key(spec: Any) -> str:
-    """Name of a piece of work: a hash of the type and every field of dataclass ``spec``.
+    """Key of a work item: a hash of the type and every field of dataclass ``spec``.
 
-    Two specs that differ in any field have different keys, so a changed configuration never meets
-    the results of another.
+    Specs that differ in any field have different keys, so a changed configuration never reuses the
+    results of another.
     """
     content = {"type": type(spec).__name__, **dataclasses.asdict(spec)}
     text = json.dumps(content, sort_keys=True, default=str)
@@ -39,13 +39,13 @@ def spec_key(spec: Any) -> str:
 
 
 class RecordFile:
-    """Append-only file of JSON lines, each with a ``key``; the last line of a key counts.
+    """Append-only file of JSON lines, each with a ``key``; the last line with a key counts.
 
-    A line is on disk, whole, when ``append`` returns. One that a kill cut short does not count, and
-    the next ``append`` removes it.
+    When ``append`` returns, the complete line is on disk. A line cut short by a kill is ignored,
+    and the next ``append`` removes it.
 
     Args:
-        path: of the file; it and its folder are created by the first ``append``.
+        path: the file; the first ``append`` creates it and its folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,7 +55,7 @@ class RecordFile:
         """Rows by key, in the order of their first appearance.
 
         Raises:
-            InputError: no regular file, larger than 1 GiB, or it holds something else.
+            InputError: not a regular file, larger than 1 GiB, or with other content.
         """
         if not is_named(self.path):
             return {}
@@ -77,17 +77,17 @@ class RecordFile:
         return rows
 
     def append(self, row: Row) -> None:
-        """Add one row, as `output_files.append_line` does."""
+        """Add one row with `output_files.append_line`."""
         append_line(self.path, json.dumps(to_plain(row), allow_nan=False).encode() + b"\n")
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write ``content``, whole or not at all; see :func:`to_plain` for what JSON does not have."""
+    """Write ``content`` atomically; :func:`to_plain` converts values that JSON lacks."""
     write_text(path, to_text(to_plain(content)) + "\n")
 
 
 def to_text(content: Any, margin: str = "\n") -> str:
-    """JSON of plain ``content``: what is short, or holds no list or mapping, stands on one line."""
+    """JSON text of plain ``content``; short or flat parts stay on one line."""
     line = json.dumps(content, allow_nan=False)
     inner = content.values() if isinstance(content, dict) else content
     if len(line) <= _LINE or not any(value and isinstance(value, (dict, list)) for value in inner):
@@ -99,7 +99,7 @@ def to_text(content: Any, margin: str = "\n") -> str:
 
 
 def to_plain(content: Any) -> Any:
-    """``content`` in JSON's types: NaN (not known) becomes null, infinity (never) a text.
+    """``content`` in JSON types: NaN (unknown) becomes null, infinity (never) a text.
 
     Paths become texts, dataclasses mappings.
     """
@@ -119,7 +119,7 @@ def to_plain(content: Any) -> Any:
 
 
 def from_plain(content: Any) -> Any:
-    """What :func:`to_plain` was given, but None where that had NaN."""
+    """Reverse :func:`to_plain`, except that NaN stays None."""
     if isinstance(content, dict):
         return {key: from_plain(value) for key, value in content.items()}
     if isinstance(content, list):
@@ -137,15 +137,15 @@ _PLAIN: Mapping[str, tuple[type, ...]] = {
     "Sequence[float | None]": (int, float, NoneType),
     "Sequence[int]": (int,),
     "Sequence[str]": (str,),
-}  # annotation to what JSON may have there
+}  # annotation to the JSON types allowed there
 
 
 def build(cls: type[T], values: Mapping[str, Any]) -> T:
-    """Dataclass ``cls`` from JSON that a stranger may have written.
+    """Build dataclass ``cls`` from untrusted JSON.
 
     Raises:
-        TypeError: a missing or unknown field, or a value of another type than its field says.
-        OverflowError: an integer that no float can hold.
+        TypeError: a missing or unknown field, or a value of the wrong type.
+        OverflowError: an integer too large for a float.
     """
     made = cls(**values)
     for field in dataclasses.fields(made):  # type: ignore[arg-type]
@@ -163,11 +163,11 @@ def build(cls: type[T], values: Mapping[str, Any]) -> T:
 def check_plain(
     name: str, value: Any, kinds: tuple[type, ...] = (str, int, float, NoneType)
 ) -> None:
-    """Refuse a value of JSON of another kind.
+    """Refuse a JSON value of another type than ``kinds``.
 
     Raises:
-        TypeError: not one of ``kinds``.
-        OverflowError: an integer that no float can hold.
+        TypeError: a type not in ``kinds``.
+        OverflowError: an integer too large for a float.
     """
     if not isinstance(value, kinds):
         raise TypeError(f"{name} is {type(value).__name__}")

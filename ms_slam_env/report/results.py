@@ -1,15 +1,15 @@
-"""The one form of a result on disk: kind, version, provenance, rows or metrics, tables, charts.
+"""File format of results: kind, version, provenance, rows or metrics, tables, charts.
 
-``results.json`` (of products such as ``ms-slam run``: ``metrics.json``) holds::
+``results.json`` (``metrics.json`` for commands such as ``ms-slam run``) holds::
 
     {"kind": ..., "title": ..., "about": ..., "results_version": ..., "provenance": {...},
      "config": {...}, "rows": [{"spec": {...}, "result": {...}, "error": null, ...}, ...],
      "tables": [...], "charts": [...]}
 
-Whatever has a kind and tables is shown by ``ms-slam report``, which knows nothing else of it.
+``ms-slam report`` shows any file with a kind and tables, and needs nothing else.
 
-Committed, the file stands alone and compressed, as ``results.json.xz``: what lay beside it was made
-of it. Every reader takes either form.
+A committed result consists of this file alone, compressed as ``results.json.xz``, since the other
+files of the folder are made from it. Every reader accepts both forms.
 """
 
 from __future__ import annotations
@@ -39,26 +39,26 @@ from ms_slam_env.report.tables import Table, table_from_json
 RESULTS = "results.json"
 TABLE = "table.md"
 PACKED = ".xz"
-"""What the name of a compressed result ends with."""
+"""Suffix of a compressed result."""
 
 _MAX_BYTES = 200_000_000
 
 
 @dataclass(frozen=True)
 class Results:
-    """A result that was read or is to be written.
+    """A result that was read from a file or will be written to one.
 
     Attributes:
         kind: name of the experiment or command.
         title: what was run, in a few words.
-        about: what it shows, one or two sentences.
-        tables: the first is the most important.
-        charts: the same.
-        rows: of an experiment; empty for others.
+        about: what it shows, in one or two sentences.
+        tables: tables, the most important first.
+        charts: charts, the most important first.
+        rows: rows of an experiment; empty for other results.
         rows_key: key of the rows in the file.
         content: everything else: configuration, metrics of a single run.
         provenance: command, versions, commit, machine, time.
-        version: of the algorithms that made it.
+        version: version of the algorithms that made it.
     """
 
     kind: str
@@ -74,7 +74,7 @@ class Results:
 
     @property
     def stale(self) -> str:
-        """A sentence where older algorithms than the present ones made the result, else empty."""
+        """A warning if older algorithms than the current ones made the result, otherwise empty."""
         since = versions_since(self.version, self.kind)
         if not since:
             return ""
@@ -86,7 +86,7 @@ class Results:
 
     @property
     def uncommitted(self) -> str:
-        """A sentence where files differed from the commit that is named, else empty."""
+        """A warning if files differed from the recorded commit, otherwise empty."""
         rows = [str(row.get("commit")).endswith(DIRTY) for row in self.rows]
         if any(rows):
             return f"{sum(rows)} of {len(rows)} rows were made with code that is in no commit."
@@ -95,11 +95,11 @@ class Results:
 
     @property
     def caveats(self) -> str:
-        """What is to be known before a figure is believed: its age, its code; empty if nothing."""
+        """Warnings about old or uncommitted code behind the result; empty if there are none."""
         return " ".join(filter(None, (self.stale, self.uncommitted)))
 
     def as_markdown(self) -> str:
-        """The tables, a note with what is to be known first, and what made them."""
+        """The caveats, the tables, and their provenance, as Markdown."""
         parts = [f"*{self.caveats}*\n"] if self.caveats else []
         parts += [table.as_markdown() for table in self.tables]
         parts.append(made_by(self.provenance, self.rows))
@@ -118,19 +118,19 @@ def write_results(
     content: Mapping[str, Any] | None = None,
     metrics: Mapping[str, Any] | None = None,
 ) -> Results:
-    """Write a result file, whole or not at all.
+    """Write a result file, atomically.
 
     Args:
-        path: of the file.
-        kind: see :class:`Results`, as the next seven.
-        title: of the result.
+        path: the file.
+        kind: see :class:`Results`, also for the next arguments.
+        title: title of the result.
         about: what it shows.
-        tables: of metrics.
-        charts: of metrics.
-        rows: with ``result``, whose keys are checked.
-        rows_key: where the rows stand.
-        content: configuration and the like, not checked.
-        metrics: flat metrics of a single run, which stand at the top of the file.
+        tables: tables of metrics.
+        charts: charts of metrics.
+        rows: rows with a ``result``, whose keys are checked.
+        rows_key: key of the rows in the file.
+        content: configuration and other entries, not checked.
+        metrics: flat metrics of a single run, at the top level of the file.
 
     Raises:
         InputError: a result with a key that the registry does not know.
@@ -162,12 +162,12 @@ def write_results(
 def write_result_folder(
     out: Path, name: str, write_more: Callable[[Path], object] = lambda folder: None, **result: Any
 ) -> Results:
-    """Write a result with its tables in Markdown and its charts as PNG, all of it or nothing.
+    """Write a result with its tables as Markdown and its charts as PNG, all or nothing.
 
     Args:
         out: folder of the result.
-        name: of the result file.
-        write_more: writes what else belongs to it into the folder that it is given.
+        name: name of the result file.
+        write_more: writes further files into the folder that it is given.
         result: see `write_results`.
 
     Raises:
@@ -183,13 +183,13 @@ def write_result_folder(
         save_charts(results.charts, folder)
         write_more(folder)
     for figure in before - {f"{chart.name}.png" for chart in results.charts}:
-        if Path(figure).name == figure:  # a file may name another folder's
+        if Path(figure).name == figure:  # the old file may name a figure in another folder
             (out / figure).unlink(missing_ok=True)
     return results
 
 
 def _figures_of(path: Path) -> set[str]:
-    """Files of the charts that a result before had, which the next one may not have."""
+    """Chart files of the previous result, which the new one may lack."""
     try:
         return (
             {f"{chart.name}.png" for chart in read_results(path).charts} if path.exists() else set()
@@ -199,7 +199,7 @@ def _figures_of(path: Path) -> set[str]:
 
 
 def read_results(path: Path) -> Results:
-    """Read a result file, or the compressed one, ``path.xz``, that stands in its place.
+    """Read a result file, or its compressed form ``path.xz``.
 
     Raises:
         InputError: no such file, not a result, or keys that the registry does not know.
@@ -242,17 +242,17 @@ _RETITLED = {
     "Sooner from the same start": "Share of starts, by area under the F-score",
     "Policies as one": "Policies of each training pooled",
 }
-"""Titles of the planner benchmark's tables in older results, and what they are called now."""
+"""Titles of the planner benchmark's tables in older results, and their current titles."""
 
 
 def _retitled(table: Table) -> Table:
-    """A table of an older result by its title of today, behind a task's name or another title."""
+    """``table`` with its current title; a task's name or another title may precede it."""
     parts = [_RETITLED.get(part, part) for part in table.title.split(": ")]
     return replace(table, title=": ".join(parts))
 
 
 def _unpacked(path: Path) -> Any:
-    """JSON of a compressed file, which a stranger may have written."""
+    """JSON of a compressed, untrusted file."""
     data = read_bytes(path, "result", _MAX_BYTES)
     unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_MAX_BYTES)
     try:
@@ -265,12 +265,12 @@ def _unpacked(path: Path) -> Any:
 
 
 def pack_results(source: Path, target: Path) -> list[Path]:
-    """Write the results of folder ``source`` into ``target``, compressed; return what was written.
+    """Write the results of folder ``source`` compressed into ``target``; return the written files.
 
-    Other files of ``target`` that ``source`` has, too (a picture that a page shows), are renewed.
+    Other files that are in both folders (such as a picture that a page shows) are replaced.
 
     Raises:
-        InputError: no result in ``source``, or a JSON file that is none.
+        InputError: no result in ``source``, or a JSON file that is not a result.
     """
     files = {}
     for path in sorted(source.glob("*.json")):
@@ -290,7 +290,7 @@ def pack_results(source: Path, target: Path) -> list[Path]:
 
 
 def _checked_rows(rows: Any) -> list[Mapping[str, Any]]:
-    """Rows of a file, as far as tables and pages read them."""
+    """Rows of a file, with the fields checked that tables and pages read."""
     for row in rows:
         for key in ("commit", "error"):
             check_plain(key, row.get(key), (str, NoneType))
@@ -323,7 +323,7 @@ def is_result(content: Any) -> bool:
 
 
 def made_by(given: Mapping[str, Any], rows: Sequence[Mapping[str, Any]] = ()) -> str:
-    """A line that says which command, version, commits and machine made a result."""
+    """One line with the command, version, commits and machine that made a result."""
     commits = {row["commit"] for row in rows if row.get("commit")} or {given.get("commit")}
     known = sorted(commit for commit in commits if commit)
     version = given.get("versions", {}).get("ms-slam-env", "")

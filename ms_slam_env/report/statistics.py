@@ -1,6 +1,6 @@
 """Medians with bootstrap intervals, and the aggregates across scenes of Agarwal et al. (2021).
 
-The latter are those of their library rliable 1.2.0, to the last bit: the same draws.
+The aggregates reproduce their library rliable 1.2.0 bit for bit, with the same random draws.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def median_interval(values: ArrayLike) -> Interval:
     """Median and its percentile-bootstrap interval; NaN without values.
 
     Args:
-        values: (n,) one an episode; with n = 1 the interval is the value itself.
+        values: (n,) one per episode; with n = 1 the interval is the value itself.
     """
     return bootstrap_interval((values,), lambda x, axis: np.median(x, axis=axis))
 
@@ -41,11 +41,11 @@ def median_interval(values: ArrayLike) -> Interval:
 def relative_cut(values: ArrayLike, baseline: ArrayLike) -> Interval:
     """Cut of the median against a baseline: 1 - median(values) / median(baseline).
 
-    Episodes of one scene and seed are resampled together.
+    Episodes with the same scene and seed are resampled together.
 
     Args:
-        values: (n,) one an episode.
-        baseline: (n,) the baseline's, of the same episodes in the same order.
+        values: (n,) one per episode.
+        baseline: (n,) values of the baseline for the same episodes in the same order.
     """
 
     def cut(x: Float64, y: Float64, axis: int) -> Float64:
@@ -57,7 +57,7 @@ def relative_cut(values: ArrayLike, baseline: ArrayLike) -> Interval:
 def bootstrap_interval(
     samples: tuple[ArrayLike, ...], statistic: Callable[..., Float64]
 ) -> Interval:
-    """Percentile bootstrap of ``statistic(*samples, axis=...)``, the samples paired."""
+    """Percentile bootstrap of ``statistic(*samples, axis=...)``, resampled in pairs."""
     from scipy import stats
 
     arrays = [np.asarray(sample, dtype=np.float64) for sample in samples]
@@ -94,7 +94,7 @@ def share_interval(flags: ArrayLike) -> Interval:
 
 
 def rank_correlation(a: ArrayLike, b: ArrayLike) -> float:
-    """Spearman's correlation of (n,) and (n,) values; NaN where one of them does not vary."""
+    """Spearman's correlation of values (n,) and (n,); NaN if one of them is constant."""
     from scipy import stats
 
     if np.ptp(a) == 0 or np.ptp(b) == 0:
@@ -123,17 +123,17 @@ def interquartile_means(scores: Mapping[str, Float64]) -> dict[str, Interval]:
 
 
 def improvement_matrix(scores: Mapping[str, Float64]) -> dict[tuple[str, str], Interval]:
-    """P(one planner scores higher than another), averaged across scenes, of all ordered pairs.
+    """P(one planner scores higher than another), averaged across scenes, for all ordered pairs.
 
-    Equal scores count half, so that both ways of a pair add up to 1. A resample is one of all
-    planners, each by itself, in which all pairs are compared.
+    Equal scores count half, so that both directions of a pair add up to 1. Each resample draws the
+    episodes of every planner independently and compares all pairs.
 
     Args:
         scores: planner to (episodes, scenes); planners may differ in their episodes.
     """
 
     def of_all(*resampled: Float64) -> Float64:
-        by_scene = [np.ascontiguousarray(of.T) for of in resampled]  # long rows compare faster
+        by_scene = [np.ascontiguousarray(of.T) for of in resampled]  # long rows are compared faster
         return np.array([_improvement(a, b) for a, b in combinations(by_scene, 2)])
 
     found = _stratified_bootstrap(list(scores.values()), of_all, np.random.RandomState(0))
@@ -141,11 +141,11 @@ def improvement_matrix(scores: Mapping[str, Float64]) -> dict[tuple[str, str], I
 
 
 def improvement_of_trainings(scores: Mapping[str, Float64]) -> dict[tuple[str, str], Interval]:
-    """``improvement_matrix`` of planners that are several policies, as trainings with other seeds.
+    """``improvement_matrix`` of planners with several policies, such as trainings by seed.
 
-    A resample draws policies, and episodes of each that it drew (hierarchical bootstrap): the
-    intervals hold how much one training differs from the next. With few policies they are a
-    little too narrow, of P by a factor of about sqrt(1 - 1/P), as of every bootstrap.
+    A resample draws policies, and then episodes of each (hierarchical bootstrap), so that the
+    intervals include the variation between trainings. With few policies they are slightly too
+    narrow, for P policies by a factor of about sqrt(1 - 1/P), as with every bootstrap.
 
     Args:
         scores: planner to (policies, episodes, scenes).
@@ -173,13 +173,13 @@ def _hierarchical_weights(
 
 
 def _both_ways(pairs: Mapping[tuple[str, str], Interval]) -> dict[tuple[str, str], Interval]:
-    """The pairs, and of each the other way round."""
+    """The pairs, and each pair reversed."""
     back = {(b, a): Interval(1 - p.value, 1 - p.high, 1 - p.low) for (a, b), p in pairs.items()}
     return {**pairs, **back}
 
 
 def _improvement(a: Float64, b: Float64) -> float:
-    """rliable's ``probability_of_improvement`` of (scenes, m) over (scenes, n)."""
+    """rliable's ``probability_of_improvement`` of scores (scenes, m) over (scenes, n)."""
     a, b = a[:, :, None], b[:, None]
     more, less = np.count_nonzero(a > b), np.count_nonzero(a < b)
     return 0.5 + 0.5 * (more - less) / (a.size * b.shape[2])
@@ -190,15 +190,15 @@ def _stratified_bootstrap(
     aggregate: Callable[..., Float64],
     rng: np.random.RandomState,
 ) -> list[Interval]:
-    """Percentile intervals of what ``aggregate`` makes of ``scores``, (k,).
+    """Percentile intervals of the values (k,) that ``aggregate`` computes from ``scores``.
 
-    A resample draws the episodes of each planner and scene anew, from the stream that rliable
-    draws from: the tables that it made stay as they are.
+    A resample redraws the episodes of each planner and scene from the same random stream as
+    rliable, so that tables made with it do not change.
 
     Args:
-        scores: (episodes, scenes) each.
-        aggregate: of as many resampled ones.
-        rng: where the draws come from.
+        scores: one array (episodes, scenes) per planner.
+        aggregate: function of as many resampled arrays.
+        rng: source of the draws.
     """
     drawn = np.array(
         [

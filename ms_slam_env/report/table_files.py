@@ -1,4 +1,4 @@
-"""Tables for papers and for spreadsheets: LaTeX and CSV."""
+"""Write tables for papers (LaTeX) and spreadsheets (CSV)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SPECIAL = {
 
 
 def as_latex(table: Table) -> str:
-    """The table as a ``tabular`` with rules of the package booktabs, title and note as caption."""
+    """The table as a ``tabular`` with booktabs rules; title and note become the caption."""
     keys = [(column.name, column.key or column.name) for column in table.columns]
     caption = " ".join(f"{part.rstrip('.')}." for part in (table.title, table.note) if part)
     lines = [
@@ -41,10 +41,10 @@ def as_latex(table: Table) -> str:
 
 
 def as_csv(table: Table) -> str:
-    """The table's values in full, in the units that they are stored in, names as header.
+    """The table's values in full precision and in their stored units, with names as header.
 
-    An interval fills three columns, ``NAME``, ``NAME_low``, ``NAME_high``; what is not known is
-    empty, what never came ``inf``.
+    An interval takes three columns, ``NAME``, ``NAME_low`` and ``NAME_high``. Unknown values are
+    empty; a time of something that never happened is ``inf``.
     """
     names = [column.name for column in table.columns]
     ranged = {n for n in names if any(isinstance(row.get(n), Interval) for row in table.rows)}
@@ -58,7 +58,7 @@ def as_csv(table: Table) -> str:
 
 
 FORMATS = {"latex": ("tex", as_latex), "csv": ("csv", as_csv)}
-"""Ending and text of each."""
+"""Format to file extension and conversion function."""
 
 
 def write_tables(tables: Sequence[Table], folder: Path, formats: Sequence[str]) -> None:
@@ -75,10 +75,10 @@ def write_tables(tables: Sequence[Table], folder: Path, formats: Sequence[str]) 
 
 
 def check_formats(formats: Sequence[str]) -> None:
-    """Refuse an unknown format of tables.
+    """Refuse an unknown table format.
 
     Raises:
-        InputError: naming the valid ones.
+        InputError: unknown format; the message names the valid ones.
     """
     for name in formats:
         if name not in FORMATS:
@@ -86,7 +86,7 @@ def check_formats(formats: Sequence[str]) -> None:
 
 
 def escaped(text: str) -> str:
-    """``text`` as LaTeX prints it."""
+    """``text`` escaped for LaTeX."""
     return "".join(_SPECIAL.get(c, c) for c in " ".join(text.split()))
 
 

@@ -1,4 +1,4 @@
-"""Tables of metrics with intervals: as Markdown, and as JSON that a report shows."""
+"""Tables of metrics with intervals, as Markdown and as JSON for reports."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.records import build, check_plain
 from ms_slam_env.report.statistics import Interval, median_interval, share_interval
 
-_SMALLEST = 1e-6  # what is smaller would be a row of zeros
+_SMALLEST = 1e-6  # smaller values would print as a row of zeros
 
 Value = str | float | int | bool | None | Interval
 Row = Mapping[str, Any]
@@ -22,10 +22,10 @@ class Column:
     """A column of a table.
 
     Attributes:
-        name: of its cells in the rows.
-        key: of the metric, which has heading, unit and explanation; ``name`` if empty.
-        heading: in place of the metric's, where several columns show one metric, as in a table with
-            a column a scene.
+        name: name of its cells in the rows.
+        key: key of the metric, which has heading, unit and explanation; ``name`` if empty.
+        heading: heading instead of the metric's, for tables with several columns of one metric,
+            such as one per scene.
     """
 
     name: str
@@ -42,12 +42,12 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; what the columns mean stands in the registry of metrics.
+    """A table; the metric registry explains its columns.
 
     Attributes:
-        columns: see :func:`make_table` for a shorter way.
-        rows: column name to value, in the unit that the metric is stored in; None: not known.
-        title: above it.
+        columns: columns; :func:`make_table` is a shorter way to give them.
+        rows: column name to value, in the metric's stored unit; None if unknown.
+        title: title above the table.
         note: a sentence or two below the title.
 
     Raises:
@@ -65,7 +65,7 @@ class Table:
             metric(column.key or column.name)
 
     def as_json(self) -> dict[str, Any]:
-        """The table as JSON's types."""
+        """The table as plain JSON types."""
         return {
             "title": self.title,
             "note": self.note,
@@ -77,7 +77,7 @@ class Table:
         }
 
     def as_markdown(self, level: int = 3) -> str:
-        """Title, note and table."""
+        """Title, note and table as Markdown."""
         parts = []
         if self.title:
             parts.append(f"{'#' * level} {self.title}\n")
@@ -95,9 +95,9 @@ def make_table(
     title: str = "",
     note: str = "",
 ) -> Table:
-    """A table whose columns are given by name where the metric's own heading will do.
+    """Make a table; a column with the metric's own heading can be given by name.
 
-    Cells of no column are dropped.
+    Drops cells that belong to no column.
     """
     full = tuple(Column(column) if isinstance(column, str) else column for column in columns)
     names = [column.name for column in full]
@@ -106,11 +106,11 @@ def make_table(
 
 
 def table_from_json(content: Mapping[str, Any]) -> Table:
-    """The table that :meth:`Table.as_json` wrote.
+    """Rebuild a table from the output of :meth:`Table.as_json`.
 
     Raises:
         InputError: a key that the registry does not know.
-        KeyError, TypeError: content of another form.
+        KeyError, TypeError: malformed content.
     """
     columns = [build(Column, column) for column in content["columns"]]
     names = {column.name for column in columns}
@@ -122,7 +122,7 @@ def table_from_json(content: Mapping[str, Any]) -> Table:
 
 
 def _value_from_json(value: Any) -> Value:
-    """The value that was written; JSON has null for NaN."""
+    """The original value; JSON holds null for NaN."""
     if isinstance(value, dict):
         return Interval(**{n: math.nan if v is None else float(v) for n, v in value.items()})
     check_plain("a cell", value)
@@ -131,14 +131,14 @@ def _value_from_json(value: Any) -> Value:
 
 @dataclass(frozen=True)
 class Grouping:
-    """How rows of an experiment become the rows of a table.
+    """How to group rows of an experiment into lines of a table.
 
     Attributes:
-        by: fields of the specification that a line is about.
-        keys: metrics of the result.
-        label: what the line says for a field, where not the value itself.
-        rank_by: metric that orders the lines, best first; empty: order of appearance.
-        count: key of a column that counts the finished rows of a line; empty: none.
+        by: fields of the spec that a line groups by.
+        keys: metrics to summarise.
+        label: text for a field's value, if it differs from the value.
+        rank_by: metric that orders the lines, best first; order of appearance if empty.
+        count: key of a column with the number of finished rows per line; none if empty.
     """
 
     by: tuple[str, ...]
@@ -148,7 +148,7 @@ class Grouping:
     count: str = ""
 
     def table(self, rows: Sequence[Row], title: str = "", note: str = "") -> Table:
-        """Medians (of flags: shares) with 95 % intervals over the finished rows of each line."""
+        """Medians (shares for flags) with 95 % intervals over the finished rows of each line."""
         lines: list[dict[str, Value]] = []
         for group, results in grouped(rows, self.by).items():
             values: dict[str, Value] = {
@@ -166,7 +166,7 @@ class Grouping:
 
 
 def measured(keys: Sequence[str], rows: Iterable[Row]) -> tuple[str, ...]:
-    """The metrics without those that came after all finished rows were measured."""
+    """The metrics except those added after all finished rows were measured."""
     results = [row["result"] for row in finished(rows)]
     return tuple(key for key in keys if not results or any(key in one for one in results))
 
@@ -177,7 +177,7 @@ def finished(rows: Iterable[Row]) -> list[Row]:
 
 
 def grouped(rows: Iterable[Row], by: Sequence[str]) -> dict[tuple[Any, ...], list[Row]]:
-    """Results of finished rows by the values of fields ``by`` of their specifications."""
+    """Results of finished rows, grouped by the values of fields ``by`` of their specs."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in finished(rows):
         groups.setdefault(tuple(row["spec"][name] for name in by), []).append(row["result"])
@@ -185,11 +185,11 @@ def grouped(rows: Iterable[Row], by: Sequence[str]) -> dict[tuple[Any, ...], lis
 
 
 def complete_cases(rows: Iterable[Row], case: Sequence[str], compared: str) -> list[Row]:
-    """Finished rows of the cases that everything compared has finished.
+    """Finished rows of the cases that all compared values have finished.
 
     Args:
-        rows: of an experiment.
-        case: fields of the specification that make a case, as scene and seed.
+        rows: rows of an experiment.
+        case: fields of the spec that define a case, such as scene and seed.
         compared: field whose values are compared in each case.
     """
     done = finished(rows)
@@ -204,8 +204,7 @@ def complete_cases(rows: Iterable[Row], case: Sequence[str], compared: str) -> l
 def flattened(rows: Iterable[Row], key: str) -> list[dict[str, Any]]:
     """A row for each mapping in the list ``key`` of each finished row's result.
 
-    What labels it, texts and flags among its values, joins the specification, so that rows can be
-    grouped by it.
+    Its texts and flags are added to the spec, so that rows can be grouped by them.
     """
     return [
         {
@@ -219,7 +218,7 @@ def flattened(rows: Iterable[Row], key: str) -> list[dict[str, Any]]:
 
 
 def summary(results: Iterable[Row], key: str) -> Interval:
-    """Median, of flags the share, of a metric with its 95 % interval; NaN without values."""
+    """Median (share for flags) of a metric with its 95 % interval; NaN without values."""
     values = [result[key] for result in results if result.get(key) is not None]
     values = [value for value in values if not math.isnan(value)]
     return share_interval(values) if metric(key).unit == "flag" else median_interval(values)
@@ -233,13 +232,13 @@ def _rank(value: Any, better: str) -> float:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, first column left-aligned, the others right."""
+    """A Markdown table with the first column left-aligned and the others right-aligned."""
     lines = [_line(header), _line(["---", *["---:"] * (len(header) - 1)])]
     return "\n".join(lines + [_line(row) for row in rows]) + "\n"
 
 
 def format_value(value: Value, key: str) -> str:
-    """``value`` of metric ``key`` in the unit that it is shown in; ``-`` where it is not known."""
+    """``value`` of metric ``key`` as text in its shown unit; ``-`` if unknown."""
     of = metric(key)
     if value is None:
         return "-"
@@ -269,7 +268,7 @@ def format_interval(interval: Interval, scale: float = 1.0, digits: int = 2) -> 
 def format_number(value: float, digits: int = 2) -> str:
     """``value`` with ``digits`` significant digits; below a millionth in exponent notation.
 
-    Infinity, which is what a time is worth until something that never came, reads ``never``.
+    Infinity, the time of something that never happened, becomes ``never``.
     """
     if math.isnan(value):
         return "-"

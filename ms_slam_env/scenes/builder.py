@@ -1,4 +1,4 @@
-"""Assembles a scene's triangles from parametric patches in local frames, texture in metres."""
+"""Builds a scene's mesh from parametric patches in local frames, with textures in metres."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Material:
         texture: index of the image among the builder's textures.
         tile_m: (width, height) in metres that the image covers; None stretches the image over
             the whole patch, as for a picture.
-        region: (left, top, right, bottom) part of the image in [0, 1] that is stretched.
+        region: (left, top, right, bottom) of the image part in [0, 1] to stretch.
     """
 
     texture: int
@@ -34,14 +34,14 @@ class Material:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Everything of a mesh but its light.
+    """A mesh without light.
 
     Attributes:
         vertices: (V, 3) float64 metres.
         normals: (V, 3) float64 smooth unit normals.
-        light_points: (V, 3) float64 where the light of each vertex is gathered: the vertex moved
-            a little off the surface and away from the border of its patch, so that a vertex in a
-            corner or on an edge does not lie inside a neighbour.
+        light_points: (V, 3) float64 points where each vertex's light is computed: the vertex moved
+            slightly off the surface and away from its patch's border, so that a vertex at a corner
+            or edge is not inside a neighbour.
         faces: (F, 3) int32.
         uv: (F, 3, 2) float32.
         face_texture: (F,) int32.
@@ -61,7 +61,7 @@ class Geometry:
     labels: tuple[str, ...]
 
     def lit(self, irradiance: NDArray[np.floating]) -> TexturedMesh:
-        """The mesh under light (F, 3, 3) at the corners of the faces."""
+        """Add light (F, 3, 3) at the face corners."""
         return TexturedMesh(
             vertices=self.vertices.astype(np.float32),
             faces=self.faces,
@@ -75,7 +75,7 @@ class Geometry:
 
 
 def pick(rng: Rng, materials: Sequence[Material]) -> Material:
-    """One of some materials."""
+    """Draw one of the materials."""
     return materials[int(rng.integers(len(materials)))]
 
 
@@ -87,7 +87,7 @@ class MeshBuilder:
 
         Args:
             cell_m: flat patches are cut into cells of at most this size.
-            variety: how many images of a kind are made before they are used again; None: any.
+            variety: largest number of images per kind before they are reused; None: no limit.
         """
         self.cell_m = cell_m
         self.variety = variety
@@ -113,7 +113,7 @@ class MeshBuilder:
     def stocked(
         self, rng: Rng, kind: str, make: Callable[[], NDArray[np.uint8]]
     ) -> NDArray[np.uint8]:
-        """An image that ``make`` makes, or one of its kind that is there (see ``variety``)."""
+        """Make an image, or reuse one of its kind (see ``variety``)."""
         stock = self._stocks.setdefault(kind, [])
         if self.variety is not None and len(stock) >= self.variety:
             return stock[int(rng.integers(len(stock)))]
@@ -138,7 +138,7 @@ class MeshBuilder:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Put ``name`` and a blank before the labels of the objects added inside the block."""
+        """Prefix the labels of objects added inside the block with ``name`` and a blank."""
         previous, self._prefix = self._prefix, f"{self._prefix}{name} "
         yield
         self._prefix = previous
@@ -147,7 +147,7 @@ class MeshBuilder:
     def frame(self, origin: ArrayLike, yaw: float = 0.0, pitch: float = 0.0) -> Iterator[None]:
         """Add patches in a frame at ``origin`` (3,).
 
-        The frame is turned by ``yaw`` radians about z, then by ``pitch`` about its own x axis
+        The frame is rotated by ``yaw`` radians about z, then by ``pitch`` about its own x axis
         (positive: the front, low y, goes down).
         """
         previous = self._pose
@@ -166,9 +166,9 @@ class MeshBuilder:
         Args:
             points: (n, m, 3); the outside is where (change along m) x (change along n) points.
             material: its texture; columns run along m, rows against n (n goes up the image).
-            uv: (n, m, 2) texture coordinates in images; None takes arc lengths over the
-                material's tile, or [0, 1] where the material stretches.
-            inset: gather the light of border vertices a little inside the patch.
+            uv: (n, m, 2) texture coordinates in images; None uses arc lengths over the material's
+                tile, or [0, 1] for a stretched material.
+            inset: compute the light of border vertices slightly inside the patch.
         """
         grid = np.asarray(points, dtype=np.float64)
         if uv is None:
@@ -238,9 +238,9 @@ class MeshBuilder:
         """Add an axis-aligned box seen from outside.
 
         Args:
-            low: (3,) least corner.
-            high: (3,) greatest corner.
-            material: of all sides.
+            low: (3,) lower corner.
+            high: (3,) upper corner.
+            material: material of all sides.
             skip: sides to leave out, of "xXyYzZ" (lower case: the low side).
             top: material of the upper side instead.
             front: material of the low-y side instead.
@@ -266,9 +266,10 @@ class MeshBuilder:
         """Add a surface of revolution about the z axis through ``centre``.
 
         Args:
-            profile: (n, 2) radius and height; going up shows the outside, going down the inside.
+            profile: (n, 2) radius and height; an upward profile shows the outside, a downward one
+                the inside.
             material: its texture.
-            sides: facets around.
+            sides: number of facets around the axis.
             centre: (3,).
         """
         r, z = np.asarray(profile, dtype=np.float64).T
@@ -304,7 +305,7 @@ class MeshBuilder:
         grid[:, -1] = grid[:, 0]
         tile = material.tile_m or (1.0, 1.0)
         across = hi - lo
-        # Seen from above and from the front alike: u along x + y, v along z + y.
+        # Looks similar from above and from the front: u along x + y, v along z + y.
         u = (grid[..., 0] + 0.6 * grid[..., 1]) / tile[0]
         v = -(grid[..., 2] + 0.6 * grid[..., 1]) / tile[1]
         if material.tile_m is None:
@@ -327,7 +328,7 @@ class MeshBuilder:
         vertices, normals, light_points, faces, uv, face_texture, face_label = columns
         corners = vertices.astype(np.float32).astype(np.float64)[faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        keep = np.einsum("ij,ij->i", cross, cross) > 1e-14  # a lathe's pole has empty cells
+        keep = np.einsum("ij,ij->i", cross, cross) > 1e-14  # a lathe's pole has degenerate cells
         return Geometry(
             vertices,
             normals,

@@ -47,7 +47,7 @@ def corridor(seed: int) -> MeshScene:
     mesh, exposure = light_and_expose(build, lighting, line, _KEY)
 
     def start(draw: Rng) -> tuple[Float64, Float64]:
-        # Oblique views: along its axis most of a corridor is out of the sensor's range.
+        # Oblique views: along its axis, most of a corridor is beyond the sensor's range.
         eye = np.array([draw.uniform(0.8, w - 0.8), draw.uniform(0.4, d - 0.4), 0.0])
         eye[2] = draw.uniform(1.1, 1.6)
         ahead = draw.uniform(0.5, 2.2) * draw.choice([-1, 1])

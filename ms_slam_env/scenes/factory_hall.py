@@ -1,4 +1,4 @@
-"""A factory hall: rows of like racks, machines, columns, crates, painted lanes on the floor."""
+"""A factory hall: rows of similar racks, machines, columns, crates, painted lanes on the floor."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from ms_slam_env.scenes.textures.noise import hsv
 _KEY = 0.16
 _CELL_M = 0.5
 _AISLE_M = 3.0
-_LANE_M = 3.4  # along the walls
+_LANE_M = 3.4  # width of the lanes along the walls
 _OFF_RACKS_M = 1.1
-_LINES_M = 0.9  # from the middle of a lane
+_LINES_M = 0.9  # distance of the lines from a lane's centre
 _WAYS = (("A", "B"), ("B", "C"), ("C", "D"), ("D", "A"), ("E", "F"))
 
 
 def factory_hall(seed: int) -> LargeScene:
     """Build the hall of ``seed``: 26 to 28 m long (x), 19 to 20 m wide (y), 6 m high.
 
-    Places: "A", "B", "C", "D" at the corners of the lane around the racks, against the clock, and
-    the ends "E" (at x low) and "F" of the middle aisle.
+    Places: "A", "B", "C", "D" at the corners of the lane around the racks, counter-clockwise, and
+    the ends "E" (low x) and "F" of the middle aisle.
     """
     rng = np.random.default_rng([seed, 13])
     bays, rows = 6, 4
@@ -79,7 +79,7 @@ def _places(room: Room, x0: float, y0: float, length: float, width: float) -> di
     """Turning points on the lane around the racks and in the aisle between rows 0 and 1."""
     half = 0.5 * _LANE_M
     low_x, high_x = x0 - half, x0 + length + half
-    low_y, high_y = y0 - _OFF_RACKS_M, y0 + width + _OFF_RACKS_M  # machines narrow these two
+    low_y, high_y = y0 - _OFF_RACKS_M, y0 + width + _OFF_RACKS_M  # machines narrow these two lanes
     aisle = y0 + industrial.RACK_DEPTH_M + 0.5 * _AISLE_M
     other = y0 + 3 * industrial.RACK_DEPTH_M + 1.5 * _AISLE_M
     corners = {

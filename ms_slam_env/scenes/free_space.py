@@ -1,4 +1,4 @@
-"""Where a camera may be: a grid of distances to the surface, 0 inside objects and outside."""
+"""Free space for a camera: a grid of distances to the surface, 0 inside objects and outside."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _GRID_ERROR = 0.4  # of a voxel
 _MAX_CELLS = 6_000_000
 
 ComponentRule = Callable[[Bool, Float64, float], Bool]
-"""Which voxels (nx, ny, nz) are free, of those that are empty, their origin (3,) and edge."""
+"""Selects the free voxels (nx, ny, nz), given the empty ones, their origin (3,) and edge."""
 
 
 @dataclass(frozen=True)
 class Holding:
-    """The connected components of empty voxels that hold the points ``inside`` (K, 3)."""
+    """The connected components of empty voxels that contain the points ``inside`` (K, 3)."""
 
     inside: Float64
 
@@ -38,23 +38,23 @@ class Holding:
 
 
 def trilinear(values: NDArray[np.floating], f: Float64) -> Float64:
-    """What lies at places f (N, 3) in [0, 1] between the values (N, 2, 2, 2) at the corners."""
+    """Trilinear interpolation at f (N, 3) in [0, 1] of corner values (N, 2, 2, 2)."""
     along_x = values[:, 0] + (values[:, 1] - values[:, 0]) * f[:, 0, None, None]
     along_y = along_x[:, 0] + (along_x[:, 1] - along_x[:, 0]) * f[:, 1, None]
     return along_y[:, 0] + (along_y[:, 1] - along_y[:, 0]) * f[:, 2]
 
 
 def voxel_for(low: Float64, high: Float64, voxel_m: float = VOXEL_M) -> float:
-    """Edge of the voxels between the corners (3,) of a box: ``voxel_m``, more where it is large."""
+    """Voxel edge for a box with corners (3,): ``voxel_m``, or more if the box is large."""
     volume = float(np.prod(high - low + 4 * voxel_m))
     return max(voxel_m, (volume / _MAX_CELLS) ** (1 / 3))
 
 
 class FreeSpace:
-    """Distance to the nearest surface on a voxel grid, looked up trilinearly.
+    """Distance to the nearest surface on a voxel grid, interpolated trilinearly.
 
-    The surface in a voxel is taken at the mean of its samples, so a distance may err by somewhat
-    less than a voxel where the surface in the nearest voxel bends.
+    The surface in a voxel is represented by the mean of its samples, so the distance may err by
+    almost a voxel if the surface in the nearest voxel is curved.
 
     Attributes:
         origin: (3,) centre of the first voxel, metres.
@@ -68,9 +68,8 @@ class FreeSpace:
 
         Args:
             points: (N, 3) samples of the surface, closer together than ``voxel_m``.
-            rule: which of the empty voxels are the free space.
-            voxel_m: edge of a voxel; made larger where the scene is so big that the grid would
-                not fit in memory.
+            rule: selects the free voxels among the empty ones.
+            voxel_m: edge of a voxel; increased if the grid would not fit in memory.
         """
         low, high = points.min(0), points.max(0)
         self.voxel_m = voxel_for(low, high, voxel_m)
@@ -78,7 +77,7 @@ class FreeSpace:
         shape = tuple(np.ceil((high - low) / self.voxel_m).astype(int) + 4)
         index = np.rint((points - self.origin) / self.voxel_m).astype(np.int64)
         flat = np.ravel_multi_index(tuple(index.T), shape)
-        # The surface's mean point in each occupied voxel makes distances finer than the voxel.
+        # The mean surface point per occupied voxel gives distances finer than a voxel.
         count = np.bincount(flat, minlength=int(np.prod(shape)))
         occupied = count > 0
         cells = np.flatnonzero(occupied)
@@ -102,7 +101,7 @@ class FreeSpace:
 
     @classmethod
     def of_grid(cls, distance: Float32, origin: Float64, voxel_m: float) -> FreeSpace:
-        """A free space from its attributes, as ``FreeSpace`` worked them out before."""
+        """Make a free space from attributes computed earlier."""
         space = cls.__new__(cls)
         space.origin, space.voxel_m = origin, voxel_m
         space._take(distance)
@@ -130,11 +129,11 @@ class FreeSpace:
         return np.where((position == clipped).all(1), result, 0.0)
 
     def segments_are_free(self, start: Float64, ends: Float64, radius_m: float) -> Bool:
-        """Whether a ball moves from ``start`` (3,) to each of ``ends`` (N, 3) untouched, (N,).
+        """Whether (N,) a ball can move freely from ``start`` (3,) to each of ``ends`` (N, 3).
 
-        The distance to the surface changes by at most the distance walked, so samples ``step``
-        apart need a clearance of ``radius_m`` + step / 2, and a part of a voxel more for the
-        error of the grid: the answer errs to "no".
+        The distance to the surface changes by at most the distance travelled, so samples ``step``
+        apart need a clearance of ``radius_m`` + step / 2, plus part of a voxel for the grid's
+        error. The result errs on the side of False.
         """
         a = np.asarray(start, dtype=np.float64)
         ways = np.asarray(ends, dtype=np.float64) - a
@@ -153,7 +152,7 @@ class FreeSpace:
 
 @lru_cache(maxsize=256)
 def _shares(steps: int) -> Float64:
-    """Shares (steps + 1, 1) of a way at which it is looked at."""
+    """Fractions (steps + 1, 1) of a segment at which it is sampled."""
     return np.linspace(0.0, 1.0, steps + 1)[:, None]
 
 
@@ -162,7 +161,7 @@ _SHARE = 0.8
 
 
 def _directions() -> Float64:
-    """17 directions to the sides and down: many scans and models have no ceiling."""
+    """17 sideways and downward directions: many scans and models have no ceiling."""
     grid = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0)])
     grid = grid[np.abs(grid).sum(1) > 0].astype(np.float64)
     return grid / np.linalg.norm(grid, axis=1, keepdims=True)
@@ -173,7 +172,7 @@ class Enclosed:
     """The largest connected component of empty voxels that see surface in most directions.
 
     A voxel is enclosed if at least 80 % of 17 rays, sideways and downwards, hit the mesh. If none
-    is (an object seen from outside), the largest component of all empty voxels is taken.
+    is (an object seen from outside), the largest component of all empty voxels is used.
     """
 
     rays: RayCaster
@@ -191,7 +190,7 @@ class Enclosed:
             distance, _ = self.rays.first_hit(centres, np.broadcast_to(direction, centres.shape))
             hits += np.isfinite(distance)
         coarse = (hits >= _SHARE * len(directions)).reshape(index.shape[:3])
-        # A coarse cell at a wall may have its centre beyond it; walls themselves still separate.
+        # The centre of a coarse cell at a wall may be beyond it; walls themselves still separate.
         coarse = ndimage.binary_dilation(coarse, iterations=1)
         nearest = [
             np.minimum(np.arange(n) // step, m - 1)

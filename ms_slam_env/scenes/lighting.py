@@ -1,7 +1,7 @@
-"""Light baked into the mesh: lamps, windows and sun with shadows, and one bounce off surfaces.
+"""Baked light: lamps, windows and sun with shadows, and one diffuse bounce.
 
-Irradiance is in units in which 1.0 makes a white diffuse surface leave the radiance 1.0, so it is
-the physical irradiance divided by pi.
+Irradiance 1.0 gives a white diffuse surface the radiance 1.0, so it is the physical irradiance
+divided by pi.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _SHADOW_END = 0.999  # a shadow ray stops just before the light, which may be a 
 
 
 class Light(ABC):
-    """Something that shines."""
+    """A light source."""
 
     @abstractmethod
     def irradiance(self, points: Float64, normals: Float64, rays: RayCaster) -> Float32:
@@ -38,8 +38,8 @@ class Lamp(Light):
     Attributes:
         position: (3,) metres.
         intensity: (3,) linear RGB; arrives as intensity * cos / r^2.
-        radius_m: of the ball, which softens shadows; 0 is a point.
-        samples: shadow rays a point.
+        radius_m: radius of the ball, which softens shadows; 0 is a point light.
+        samples: shadow rays per point.
     """
 
     position: tuple[float, float, float]
@@ -58,12 +58,12 @@ class Lamp(Light):
 
 @dataclass(frozen=True)
 class Panel(Light):
-    """A parallelogram that shines diffusely from its front, as a window or a ceiling panel.
+    """A parallelogram that emits diffusely from its front, such as a window or a ceiling panel.
 
     Attributes:
         origin: (3,) a corner, metres.
-        edge_u: (3,) side; the front is edge_u x edge_v.
-        edge_v: (3,) other side.
+        edge_u: (3,) one side; the front faces edge_u x edge_v.
+        edge_v: (3,) the other side.
         radiance: (3,) linear RGB.
         grid: samples along edge_u and edge_v.
     """
@@ -91,13 +91,13 @@ class Panel(Light):
 
 @dataclass(frozen=True)
 class RoomLight(Light):
-    """A light of one room of several: what passes through its doors fades away behind them.
+    """A light in one room of several; beyond the room it fades out.
 
     Attributes:
         light: the source.
-        low: (3,) least corner of its room, metres.
-        high: (3,) greatest corner.
-        reach_m: distance from the room at which nothing is left.
+        low: (3,) lower corner of its room, metres.
+        high: (3,) upper corner.
+        reach_m: distance from the room at which the light has faded out.
     """
 
     light: Light
@@ -139,11 +139,11 @@ class Sun(Light):
 
 @dataclass(frozen=True)
 class SkyLight(Light):
-    """The light of an open sky, the same from everywhere above the horizon.
+    """Light of an open sky, uniform above the horizon.
 
     Attributes:
         radiance: (3,) linear RGB.
-        rays: directions in which each point looks for the sky.
+        rays: number of directions in which each point tests for the sky.
     """
 
     radiance: tuple[float, float, float]
@@ -153,7 +153,7 @@ class SkyLight(Light):
         """See the base class: 1/pi times the integral of L cos over the open part of the sky."""
         total = np.zeros(len(points), np.float32)
         k = np.arange(self.rays) + 0.5
-        up, angle = k / self.rays, np.pi * (1 + 5**0.5) * k  # even over the upper half sphere
+        up, angle = k / self.rays, np.pi * (1 + 5**0.5) * k  # uniform over the upper hemisphere
         side = np.sqrt(1 - up * up)
         for direction in np.stack([side * np.cos(angle), side * np.sin(angle), up], -1):
             lit, value = _from_afar(points, normals, direction, rays)
@@ -167,12 +167,12 @@ class Lighting:
 
     Attributes:
         lights: the sources.
-        glow: label -> (3,) irradiance of surfaces that shine by themselves (window panes, lamp
-            shades, screens); light passes through the labels listed in ``clear``.
+        glow: (3,) irradiance by label of self-luminous surfaces (window panes, lamp shades,
+            screens); light passes through the labels in ``clear``.
         clear: labels that cast no shadow.
-        ambient: (3,) linear RGB light from everywhere that no source accounts for.
-        bounce_rays: directions in which each point gathers light off other surfaces.
-        bounce_gain: factor on the one bounce, for the further ones.
+        ambient: (3,) linear RGB light from all directions, in addition to the sources.
+        bounce_rays: number of directions in which each point gathers reflected light.
+        bounce_gain: factor on the one bounce that accounts for further ones.
     """
 
     lights: tuple[Light, ...]
@@ -202,28 +202,28 @@ def light_mesh(geometry: Geometry, lighting: Lighting) -> TexturedMesh:
 def light_and_expose(
     build: MeshBuilder, lighting: Lighting, focus: Float64, key: float
 ) -> tuple[TexturedMesh, float]:
-    """Bake ``lighting`` into what was built; the lit mesh, and the exposure by what glows not."""
+    """Bake ``lighting`` into the mesh; return it and the exposure for non-glowing surfaces."""
     mesh = light_mesh(build.build(), lighting)
     return mesh, auto_exposure(mesh, focus, key, frozenset(lighting.glow))
 
 
 def _bounce(g: Geometry, direct: Float32, lighting: Lighting) -> Float32:
-    """Light (V, 3) that arrives by one reflection, and the ambient where the way is open.
+    """Light (V, 3) that arrives by one reflection, and ambient light where rays miss.
 
-    All points use the same directions in their own tangent frame, so that the error of the few
-    rays varies smoothly over a surface instead of speckling it.
+    All points use the same directions in their tangent frames, so that sampling error varies
+    smoothly over a surface instead of causing speckle.
     """
     rays = RayCaster(g.vertices, g.faces)
     albedo = mean_albedo(g.textures)[g.face_texture]  # (F, 3)
     leaving = albedo * direct[g.faces].mean(1)
-    # A few rays sample small bright patches of sun badly: limit what one ray can bring.
+    # A few rays sample small sunlit patches badly: limit the contribution of one ray.
     leaving = np.minimum(leaving, 4.0 * leaving.mean(0))
     for name, value in lighting.glow.items():
         if name in g.labels:
             of = g.face_label == g.labels.index(name)
-            # The lights already stand for what glows; only its looks are not theirs.
+            # The lights already represent glowing surfaces; only their appearance remains.
             leaving[of] = 0.0 if name in lighting.clear else 0.2 * albedo[of] * np.array(value)
-    leaving = np.concatenate([leaving, np.zeros((1, 3))]).astype(np.float32)  # miss: nothing
+    leaving = np.concatenate([leaving, np.zeros((1, 3))]).astype(np.float32)  # a miss adds nothing
     gathered = np.zeros((len(g.vertices), 3), np.float32)
     openness = np.zeros(len(g.vertices), np.float32)
     for directions in hemispheres(g.normals, lighting.bounce_rays):
@@ -247,12 +247,12 @@ def mean_albedo(textures: tuple[NDArray[np.uint8], ...]) -> Float32:
 
 
 def srgb_to_linear(value: Float64) -> Float64:
-    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    """Convert sRGB values in [0, 1] to linear light (IEC 61966-2-1)."""
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(value: Float64) -> Float64:
-    """Return the sRGB value in [0, 1] of linear intensities in [0, 1] (IEC 61966-2-1)."""
+    """Convert linear intensities in [0, 1] to sRGB values in [0, 1] (IEC 61966-2-1)."""
     return np.where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
 
 
@@ -261,9 +261,9 @@ def auto_exposure(mesh: TexturedMesh, points: Float64, key: float, skip: frozens
 
     Args:
         mesh: lit mesh.
-        points: (K, 3) where cameras look: faces are weighted by area and nearness to these.
+        points: (K, 3) where cameras look; faces are weighted by area and nearness to these.
         key: linear sensor value of the median, 0.18 for mid grey.
-        skip: labels to leave out, as panes and lamps.
+        skip: labels to leave out, such as panes and lamps.
     """
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(face_cross(corners), axis=1)
@@ -281,7 +281,7 @@ def auto_exposure(mesh: TexturedMesh, points: Float64, key: float, skip: frozens
 def _from_afar(
     points: Float64, normals: Float64, direction: Float64, rays: RayCaster
 ) -> tuple[NDArray[np.int64], Float64]:
-    """Which points (L,) face a direction (3,), and their cosines to it, 0 in shadow."""
+    """Indices (L,) of points facing a direction (3,), and their cosines to it, 0 in shadow."""
     cosine = normals @ direction
     facing = np.flatnonzero(cosine > 0)
     towards = np.broadcast_to(direction * _FAR_M, (len(facing), 3))

@@ -78,7 +78,7 @@ def _seating_side(build: MeshBuilder, rng: Rng, room: Room) -> None:
 
 
 def _television_side(build: MeshBuilder, rng: Rng, room: Room) -> Float64:
-    """TV stand at wall 2 between a floor lamp and a door; returns the bulb's place (3,)."""
+    """TV stand at wall 2 between a floor lamp and a door; returns the bulb's position (3,)."""
     side = 1 if rng.random() < 0.5 else -1
     along = 0.35 * side
     with room.at_wall(build, 2, along, gap=0.02):
@@ -145,7 +145,7 @@ def _lit(
     window: Window,
     bulb: Float64,
 ) -> MeshScene:
-    """Daylight, sun or lamps; the exposure; the start poses."""
+    """Make the scene: daylight, sun or lamps, exposure, start poses."""
     w, d, h = room.size
     day = rng.uniform(0.5, 1.0)
     corner = room.to_world(window_wall, (window.along + window.width / 2, 0.14, window.sill))

@@ -1,10 +1,10 @@
-"""Lit meshes kept on disk: what a mesh file or a dwelling becomes takes long to work out.
+"""Disk cache of lit meshes, which take long to compute from a mesh file or for a home.
 
-Entries lie in ``$MS_SLAM_ENV_CACHE``, else in ``ms_slam_env`` below ``$XDG_CACHE_HOME`` or
-``~/.cache``: one file of plain arrays each, named by a hash of what it follows from, what the mesh
-file holds or the seed, and of the version of the algorithm. The longest unused go when all take
-more than ``MOST_BYTES``; the folder may be deleted at any time. What cannot be read is worked out
-anew, and a folder that cannot be written is done without.
+Entries are stored in ``$MS_SLAM_ENV_CACHE``, else in ``ms_slam_env`` below ``$XDG_CACHE_HOME`` or
+``~/.cache``. Each is one file of plain arrays, named by a hash of its inputs (the mesh file's
+content or the seed) and of the algorithm's version. The least recently used are deleted when all
+exceed ``MOST_BYTES``; the folder may be deleted at any time. Unreadable entries are recomputed, and
+an unwritable folder is ignored.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from ms_slam_env._runtime.output_files import new_file
 from ms_slam_env.errors import InputError
 
 VERSION = 2
-"""Of what is kept and how it is worked out; goes up when either changes."""
+"""Version of the content and of its computation; increases when either changes."""
 
 MOST_BYTES = 2 * 1024**3
-"""Of all entries together."""
+"""Size limit of all entries together."""
 
 Arrays = dict[str, NDArray[Any]]
 
 
 def folder() -> Path | None:
-    """Where the entries lie; None for a user without a home folder."""
+    """Folder of the entries; None for a user without a home folder."""
     own, base = os.environ.get("MS_SLAM_ENV_CACHE"), os.environ.get("XDG_CACHE_HOME")
     home = os.path.expanduser("~")
     if not (own or base) and home == "~":
@@ -41,7 +41,7 @@ def folder() -> Path | None:
 
 
 def key(arrays: Iterable[NDArray[Any]], more: object) -> str:
-    """Name of an entry: a hash of everything that it follows from."""
+    """Name of an entry: a hash of all its inputs."""
     digest = hashlib.sha256(repr((VERSION, more)).encode())
     for array in arrays:
         digest.update(repr((array.shape, array.dtype.str)).encode())
@@ -50,24 +50,24 @@ def key(arrays: Iterable[NDArray[Any]], more: object) -> str:
 
 
 def remembered(name: str, work_out: Callable[[], Arrays]) -> Arrays:
-    """The arrays of entry ``name``; worked out, and kept, where it is not there or broken."""
+    """Load the arrays of entry ``name``, or compute and store them if missing or damaged."""
     place = folder()
     if place is None:
         return work_out()
     path = place / f"mesh-{name}.npz"
-    # Whatever a damaged archive makes its readers raise: it is made anew.
+    # Readers may raise anything on a damaged archive; it is recomputed.
     with suppress(Exception), np.load(path, allow_pickle=False) as stored:
         found = {array: stored[array] for array in stored["names"].tolist()}
         os.utime(path)
         return found
     arrays = work_out()
-    with suppress(OSError, InputError):  # a disk, a place that takes no file
+    with suppress(OSError, InputError):  # a full or unwritable disk
         _keep(path, arrays)
     return arrays
 
 
 def _keep(path: Path, arrays: Arrays) -> None:
-    """Write an entry, whole or not at all, and make room for it."""
+    """Write an entry atomically, and make room for it."""
     named: dict[str, Any] = {"names": np.array(list(arrays)), **arrays}
     with new_file(path) as descriptor, os.fdopen(descriptor, "wb", closefd=False) as file:
         np.savez(file, **named)
@@ -75,7 +75,7 @@ def _keep(path: Path, arrays: Arrays) -> None:
 
 
 def _make_room(place: Path) -> None:
-    """Delete the longest unused entries until all fit."""
+    """Delete the least recently used entries until all fit."""
     entries = sorted(place.glob("mesh-*.npz"), key=lambda one: one.stat().st_mtime, reverse=True)
     total = 0
     for one in entries:

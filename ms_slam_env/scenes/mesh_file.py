@@ -1,4 +1,4 @@
-"""A scene from a mesh file (.glb, .obj, .ply, ...), world z up, metres."""
+"""Scenes from mesh files (.glb, .obj, .ply, ...), world z up, metres."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from ms_slam_env.scenes.scene import Rng, TexturedMesh
 
 _GREY = np.array([190, 190, 190], np.uint8)
 _MAX_TRIANGLES = 900_000
-_BLOCK = 4  # texels a side for a triangle with a colour at each corner
+_BLOCK = 4  # texels per side for a triangle with vertex colours
 
 
 @dataclass(frozen=True)
 class Soup:
-    """Triangles that share no vertices.
+    """A triangle soup: triangles that share no vertices.
 
     Attributes:
         corners: (F, 3, 3) metres.
@@ -51,17 +51,17 @@ class Soup:
 
 
 def load_soup(name: str | Path) -> Soup:
-    """Read a mesh file: its path, or that with options (see ``MeshOptions``).
+    """Read a mesh file, given by its path with optional options (see ``MeshOptions``).
 
     Raises:
-        InputError: no such file, not readable as a mesh, or without a triangle.
+        InputError: no such file, not readable as a mesh, or without triangles.
     """
     file = MeshFile.named(name)
     if file is None:
         raise InputError(f"{str(name)!r} is not a mesh file ({', '.join(MESH_SUFFIXES)})")
     corners, uvs, texture, label = [], [], [], []
     images: list[NDArray[np.uint8]] = []
-    place: dict[object, int] = {}  # of an image, for parts share them
+    place: dict[object, int] = {}  # index of each image; parts share images
     texels = 0
     labels: list[str] = []
     for part in file.read():
@@ -115,7 +115,7 @@ def split_long_edges(soup: Soup, max_edge_m: float) -> Soup:
 
 
 def _appearance(part: Part) -> tuple[object, Float64, NDArray[np.uint8]]:
-    """What names the image of a part, texture coordinates (F, 3, 2), and the image."""
+    """Key of a part's image, texture coordinates (F, 3, 2), and the image."""
     tint = None if part.tint is None else tuple(part.tint)
     if part.image is not None and part.uv is not None:
         return (id(part.image), tint), np.nan_to_num(part.uv), _tinted(part.image, part.tint)
@@ -128,9 +128,9 @@ def _appearance(part: Part) -> tuple[object, Float64, NDArray[np.uint8]]:
 
 
 def _tinted(image: NDArray[np.uint8], factor: Float64 | None) -> NDArray[np.uint8]:
-    """An image multiplied by a colour (3,) in [0, 255].
+    """Multiply an image by a colour (3,) in [0, 255].
 
-    glTF multiplies linear light, nearly the same as multiplying the sRGB values, for the curve is
+    glTF multiplies linear light. Multiplying sRGB values is nearly the same, because the curve is
     close to a power.
     """
     if factor is None or not (factor < 255.0).any():
@@ -139,7 +139,7 @@ def _tinted(image: NDArray[np.uint8], factor: Float64 | None) -> NDArray[np.uint
 
 
 def _colour_atlas(colours: NDArray[np.float32]) -> tuple[Float64, NDArray[np.uint8]]:
-    """Give each triangle a small block of texels that interpolates its corners' colours.
+    """Make a texture with a block of texels per triangle that interpolates its corners' colours.
 
     Args:
         colours: (F, 3, 3) at the corners, in [0, 255].
@@ -166,10 +166,10 @@ def _plain(rgb: Any) -> NDArray[np.uint8]:
 
 _OF_MESH = ("vertices", "faces", "uv", "face_texture", "face_label", "irradiance")
 _MAX_EDGE_M = 0.3
-_MAX_COORDINATE_M = 1e4  # of a place that a camera moves in
+_MAX_COORDINATE_M = 1e4  # largest coordinate of a scene
 _UNIT = "where its unit is not the metre, say so, as in 'room.ply,scale=0.01' for centimetres"
-_MAX_VOXEL_M = 0.15  # of the free space: some 20,000 cubic metres
-_FINENESS = 0.4  # distance between samples of the surface, in voxels
+_MAX_VOXEL_M = 0.15  # of the free space, enough for about 20,000 cubic metres
+_FINENESS = 0.4  # spacing of surface samples, in voxels
 _MAX_SAMPLES = 20_000_000
 _LAMPS = 10
 _KEY = 0.2
@@ -179,15 +179,15 @@ _FACING_M = 0.06
 def from_file(name: str | Path, seed: int = 0) -> MeshScene:
     """Load a mesh and light it with lamps in its free space.
 
-    What takes long is shown, and kept on disk for the next time (``mesh_cache``).
-    The free space is the largest enclosed part (see ``Enclosed``); faces are turned towards it.
+    Slow steps show progress, and their results are cached on disk (``mesh_cache``). The free space
+    is the largest enclosed part (see ``Enclosed``); faces are turned towards it.
 
     Args:
-        name: of the file, as ``load_soup`` takes it.
+        name: the file, as in ``load_soup``.
         seed: varies the strength of the lamps.
 
     Raises:
-        InputError: no such file, not readable as a mesh, without a triangle, or too large.
+        InputError: no such file, not readable as a mesh, without triangles, or too large.
     """
     soup = load_soup(name)
     given: list[NDArray[Any]] = [soup.corners, soup.uv, soup.texture, soup.label, *soup.textures]
@@ -208,10 +208,10 @@ def from_file(name: str | Path, seed: int = 0) -> MeshScene:
 
 
 def _check_extent(soup: Soup, name: str) -> float:
-    """The edge of the voxels of a mesh's free space; a mesh too large for a camera is refused.
+    """Voxel size for a mesh's free space; refuse a mesh that is too large.
 
     Raises:
-        InputError: with its extent, and what to do if its unit is not the metre.
+        InputError: it names the extent, and what to do if the unit is not the metre.
     """
     low, high = soup.corners.min((0, 1)), soup.corners.max((0, 1))
     voxel_m = voxel_for(low, high)
@@ -225,7 +225,7 @@ def _check_extent(soup: Soup, name: str) -> float:
 
 
 def _light(soup: Soup, seed: int, name: str) -> mesh_cache.Arrays:
-    """What is kept of a mesh: lit, with its free space and its exposure.
+    """Compute a mesh's cached data: the lit mesh, its free space and its exposure.
 
     Raises:
         InputError: no free space, or too large.
@@ -254,7 +254,7 @@ def _light(soup: Soup, seed: int, name: str) -> mesh_cache.Arrays:
 
 
 def _lighting(cells: Float64, seed: int) -> Lighting:
-    """Lamps in the free space, whose strength the seed varies."""
+    """Place lamps in the free space; the seed varies their strength."""
     rng = np.random.default_rng([seed, 7])
     lamps = tuple(
         Lamp(tuple(place), tuple(rng.uniform(0.6, 1.0) * np.array([1.0, 0.95, 0.88])), 0.1, 2)
@@ -264,7 +264,7 @@ def _lighting(cells: Float64, seed: int) -> Lighting:
 
 
 def _turn_to_free_space(soup: Soup, free: FreeSpace) -> Soup:
-    """Flip the faces whose back, but not front, opens into the free space."""
+    """Flip faces whose back, but not front, opens into the free space."""
     c = soup.corners
     normal = unit_rows(face_cross(c))
     centre = c.mean(1)
@@ -278,7 +278,7 @@ def _turn_to_free_space(soup: Soup, free: FreeSpace) -> Soup:
 
 
 def _geometry(soup: Soup) -> Geometry:
-    """Join corners that share place and face direction, so that light is gathered once there."""
+    """Join corners with equal position and face direction, so that light is computed once there."""
     c = soup.corners
     normal = unit_rows(face_cross(c))
     inset = 0.9 * c + 0.1 * c.mean(1, keepdims=True) + 0.006 * normal[:, None]
@@ -301,20 +301,20 @@ def _geometry(soup: Soup) -> Geometry:
 
 
 def _free_cells(free: FreeSpace) -> Float64:
-    """Centres (N, 3) of the free voxels that are widest, at least the widest fifth."""
+    """Centres (N, 3) of the free voxels with the largest clearance, at least the top fifth."""
     wide = min(0.3, float(np.quantile(free.distance[free.distance > 0], 0.8)))
     return free.origin + free.voxel_m * np.argwhere(free.distance >= wide)
 
 
 def _eye_cells(free: FreeSpace, cells: Float64) -> Float64:
-    """Cells at 1.0 to 1.6 m above the lowest free one, or all if the space is not that high."""
+    """Cells 1.0 to 1.6 m above the lowest free one, or all if the space is lower."""
     height = cells[:, 2] - cells[:, 2].min() + float(free.clearance(cells[:1])[0])
     standing = cells[(height > 1.0) & (height < 1.6)]
     return standing if len(standing) else cells
 
 
 def _spread(cells: Float64, count: int) -> Float64:
-    """Up to ``count`` cells far from one another (farthest-point sampling), from the upper part."""
+    """Up to ``count`` cells from the upper part, spread by farthest-point sampling."""
     high = cells[cells[:, 2] >= np.quantile(cells[:, 2], 0.6)]
     high = high[:: max(1, len(high) // 20_000)]
     chosen = [high[len(high) // 2]]

@@ -1,4 +1,4 @@
-"""Rays against a triangle mesh, and samples of its surface."""
+"""Ray casting and surface sampling of a triangle mesh."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class RayCaster:
     def first_hit(
         self, origins: Float64, directions: Float64
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Return distance (N,), inf where nothing is hit, and face (N,), -1 there.
+        """Return distances (N,), inf without a hit, and faces (N,), -1 without a hit.
 
         Distances are in units of the length of ``directions`` (N, 3), which need not be 1.
         """
@@ -45,7 +45,7 @@ _PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])  # R2 low-discrepa
 
 
 def face_cross(corners: NDArray[np.floating]) -> NDArray[Any]:
-    """Normals (F, 3), twice the area long, of faces with corners (F, 3, 3)."""
+    """Normals (F, 3) with length twice the area, of faces with corners (F, 3, 3)."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
@@ -54,8 +54,8 @@ def sample_surface(
 ) -> tuple[Float64, NDArray[np.int64]]:
     """Points (N, 3), one per ``spacing_m`` squared of area, and the face (N,) each lies on.
 
-    Triangles are walked in order of index, so a point falls on a triangle in exact proportion to
-    its area; the place inside it follows the R2 sequence, so points spread evenly.
+    Triangles are visited by index, and each gets points in exact proportion to its area. Positions
+    inside follow the R2 sequence, so points spread evenly.
     """
     corners = np.asarray(vertices, dtype=np.float64)[faces]
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -71,24 +71,24 @@ def sample_surface(
 
 
 _REACH_M = (
-    1.0  # surfaces count with exp(-(distance / reach)^2), or the nearest ones if none is near
+    1.0  # surfaces have weight exp(-(distance / reach)^2); the nearest ones count if none is near
 )
-_FEWEST = 200.0  # corners' worth of weight
-_GLOW = 4.0  # times the median: what is brighter shines by itself
-_RIDGE = 0.05  # share of the weight that holds the light's direction back where little tells of it
+_FEWEST = 200.0  # least weight, in corners
+_GLOW = 4.0  # times the median; brighter surfaces are light sources
+_RIDGE = 0.05  # regularises the light's direction where there is little evidence
 _MOST_FACES = 60_000
 
 
 class LightProbe:
-    """Fits E(n) = c + n . d, light as a function of a surface's normal, to the surfaces around.
+    """Fits E(n) = c + n . d, light as a function of the surface normal, to nearby surfaces.
 
-    A sum of light from everywhere and light from one side, as the first two bands of spherical
-    harmonics: Ramamoorthi and Hanrahan, "An Efficient Representation for Irradiance Environment
-    Maps", SIGGRAPH 2001, keep three.
+    The sum of uniform and one-sided light, like the first two bands of spherical harmonics:
+    Ramamoorthi and Hanrahan, "An Efficient Representation for Irradiance Environment Maps",
+    SIGGRAPH 2001, keep three.
     """
 
     def __init__(self, mesh: TexturedMesh) -> None:
-        """Sort out the surfaces that tell of the light."""
+        """Select the surfaces that carry information about the light."""
         step = max(1, len(mesh.faces) // _MOST_FACES)
         corners = mesh.vertices[mesh.faces[::step]].astype(np.float64)
         cross = face_cross(corners)
@@ -96,7 +96,7 @@ class LightProbe:
         light = mesh.irradiance[::step].mean(axis=1).astype(np.float64)  # (F, 3)
         brightness = light.mean(axis=1)
         typical = np.median(brightness[brightness > 0]) if (brightness > 0).any() else 0.0
-        # Insides and backs, which no light reaches and no camera sees, tell nothing.
+        # Insides and backs, which receive no light and are never seen, carry no information.
         is_used = (area > 0) & (brightness > 0.05 * typical) & (brightness < _GLOW * typical)
         self._centres = corners[is_used].mean(axis=1)
         self._normals = cross[is_used] / (2 * area[is_used, None])
@@ -118,7 +118,7 @@ class LightProbe:
         mean = weight @ self._light
         basis = self._normals
         A = (basis * weight[:, None]).T @ basis + _RIDGE * np.eye(3)
-        # c is the mean over all directions, not over those that happen to be there.
+        # c is the mean over all directions, not only over those of the surfaces.
         full = np.concatenate([np.ones((len(basis), 1)), basis], axis=1)
         B = (full * weight[:, None]).T @ full
         B[1:, 1:] = A

@@ -1,4 +1,4 @@
-"""The scene made of one lit mesh, its free space and a rule for start poses."""
+"""Scenes made of one lit mesh, its free space and a rule for start poses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ms_slam_env.scenes.mesh_queries import RayCaster, face_cross, sample_surfac
 from ms_slam_env.scenes.scene import Rng, Scene, TexturedMesh
 
 StartRule = Callable[[Rng], tuple[Float64, Float64]]
-"""Draws a candidate (eye (3,), target (3,)) of a start pose."""
+"""Draws a candidate start pose (eye (3,), target (3,))."""
 
 SceneMaker = Callable[[int], Scene]
 """Builds a scene from a seed."""
@@ -28,7 +28,7 @@ _MOST_OPEN_POINTS = 20_000_000
 
 
 class MeshScene(Scene):
-    """Everything a scene must answer, from its mesh."""
+    """A scene that is defined by its mesh."""
 
     start_depth_m = START_DEPTH_M
     min_start_share = MIN_START_SHARE
@@ -44,17 +44,17 @@ class MeshScene(Scene):
         start_objects: int = 2,
         name: str = "",
     ) -> None:
-        """Put the parts together.
+        """Assemble the scene.
 
         Args:
             maker: builds the same scene again from ``seed``.
-            seed: of the scene.
-            mesh: textured and lit.
-            free_space: of the same mesh.
-            start_rule: candidates of start poses.
+            seed: seed of the scene.
+            mesh: textured and lit mesh.
+            free_space: free space of the mesh.
+            start_rule: draws candidate start poses.
             exposure: see ``Scene``.
-            start_objects: labels that a start pose must have in view.
-            name: of the scene; that of the maker by default.
+            start_objects: number of labels that a start pose must have in view.
+            name: name of the scene; the maker's by default.
         """
         self.name = name or maker.__name__
         self._maker = maker
@@ -80,7 +80,7 @@ class MeshScene(Scene):
         return self.free_space.segments_are_free(start, ends, radius_m)
 
     def sample_start(self, rng: Rng) -> Float64:
-        """See the base class; the best of the candidates tried if none is perfect."""
+        """See the base class; the best candidate if none meets all conditions."""
         best, best_score = np.eye(4), -1.0
         for _ in range(_TRIES):
             eye, target = self._start_rule(rng)
@@ -97,7 +97,7 @@ class MeshScene(Scene):
         return best
 
     def _view_quality(self, T_world_camera: Float64) -> tuple[float, int]:
-        """Share of the view at a good depth, and the number of objects in view."""
+        """Share of the view at suitable depth, and the number of objects in view."""
         u, v = np.meshgrid(np.linspace(-0.55, 0.55, 12), np.linspace(-0.42, 0.42, 9))
         rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], -1)
         origins = np.broadcast_to(T_world_camera[:3, 3], rays.shape)
@@ -109,16 +109,16 @@ class MeshScene(Scene):
     def surface_points(self, spacing_m: float = 0.01) -> tuple[Float64, Int32]:
         """See the base class.
 
-        Points whose front does not open into free space (backs of furniture against a wall,
-        insides of boxes) are left out, since no camera can see them. There are 20 million before
-        that, farther apart if they must be.
+        Points whose front does not open into free space (backs of furniture against a wall, insides
+        of boxes) are left out, since no camera can see them. Before that there are at most 20
+        million points, spaced wider if necessary.
         """
         return self._open_points(None, spacing_m, _MOST_OPEN_POINTS)
 
     def _open_points(
         self, faces: Int32 | None, spacing_m: float, most: float = np.inf
     ) -> tuple[Float64, Int32]:
-        """Points (N, 3) of some faces, or all, whose front opens into free space; labels (N,)."""
+        """Points (N, 3) on some or all faces whose front opens into free space, and labels (N,)."""
         mesh = self.mesh
         chosen = mesh.faces if faces is None else mesh.faces[faces]
         corners = mesh.vertices[chosen].astype(np.float64)
@@ -132,7 +132,7 @@ class MeshScene(Scene):
         bitangent = np.cross(normal, tangent)
         before = points + _FACING_M * normal[face]
         visible = self.clearance(before) > 0.0
-        # In an inner corner the place in front is taken by the neighbour: look beside it too.
+        # In an inner corner the neighbour occupies the space in front: test beside it too.
         for aside in (tangent, -tangent, bitangent, -bitangent):
             rest = np.flatnonzero(~visible)
             visible[rest] = self.clearance(before[rest] + _ASIDE_M * aside[face[rest]]) > 0.0
@@ -140,39 +140,39 @@ class MeshScene(Scene):
         return points[visible], labels[face[visible]]
 
     def __reduce__(self) -> tuple[object, tuple[int]]:
-        """Pickle as the recipe: a scene is rebuilt from its maker and seed, bit for bit."""
+        """Pickle only maker and seed: the scene is rebuilt from them, bit for bit."""
         return self._maker, (self.seed,)
 
 
 def free_space_around(mesh: TexturedMesh, inside: Float64) -> FreeSpace:
-    """Free space of a closed room that holds the points ``inside`` (K, 3)."""
+    """Free space of a closed room that contains the points ``inside`` (K, 3)."""
     points, _ = sample_surface(mesh.vertices, mesh.faces, 0.4 * VOXEL_M)
     return FreeSpace(points, Holding(np.asarray(inside, dtype=np.float64)))
 
 
 def unit_rows(vectors: Float64) -> Float64:
-    """Directions (N, 3) of vectors (N, 3)."""
+    """Normalise vectors (N, 3)."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
 
 
 SKY = "sky"
-"""Label of the dome that stands for the sky: beyond any range, no surface, no obstacle."""
+"""Label of the sky dome: out of range, neither surface nor obstacle."""
 
 _VOXEL_M = 0.2
 _MOST_POINTS = 3_000_000
-_FINENESS = 0.45  # distance between samples of the surface, in voxels
+_FINENESS = 0.45  # spacing of surface samples, in voxels
 
 
 class LargeScene(MeshScene):
-    """A mesh scene whose views reach farther, and whose routes are known.
+    """A mesh scene with longer views and known routes.
 
     Attributes:
-        places: name to point (3,) on the ground, metres, for routes of a camera.
+        places: points (3,) on the ground by name, metres, for camera routes.
         lanes: see ``Scene``.
     """
 
     gaze_m = 7.0
-    gaze_gap_m = 0.35  # its grid of clearances is coarse
+    gaze_gap_m = 0.35  # its clearance grid is coarse
     start_depth_m = (0.8, 12.0)
     min_start_share = 0.6
 
@@ -188,17 +188,17 @@ class LargeScene(MeshScene):
         lid_m: float = 4.5,
         lanes: tuple[tuple[Float64, Float64], ...] = (),
     ) -> None:
-        """Put the parts together.
+        """Assemble the scene.
 
         Args:
             maker: builds the same scene again from ``seed``.
-            seed: of the scene.
-            mesh: textured and lit.
-            start_rule: candidates of start poses.
+            seed: seed of the scene.
+            mesh: textured and lit mesh.
+            start_rule: draws candidate start poses.
             exposure: see ``Scene``.
-            places: see above.
-            inside: (K, 3) points that the free space holds.
-            lid_m: height above which no camera goes; counts as an obstacle.
+            places: see the class.
+            inside: (K, 3) points that the free space contains.
+            lid_m: height that no camera exceeds; counts as an obstacle.
             lanes: see ``Scene``.
         """
         self.places = dict(places)
@@ -216,8 +216,8 @@ class LargeScene(MeshScene):
     def surface_points(self, spacing_m: float = 0.01) -> tuple[Float64, Int32]:
         """See the base class; the sky is no surface.
 
-        There are ``_MOST_POINTS`` at most, farther apart if they must be: a street has thousands
-        of square metres.
+        At most ``_MOST_POINTS``, spaced wider if necessary: a street has thousands of square
+        metres.
         """
         faces = self.mesh.faces[self._solid]
         corners = self.mesh.vertices[faces].astype(np.float64)
@@ -239,7 +239,7 @@ def solid_faces(mesh: TexturedMesh) -> Int32:
 
 
 def _free_space(mesh: TexturedMesh, solid: Int32, inside: Float64, lid_m: float) -> FreeSpace:
-    """Free space below a lid at height ``lid_m``, which keeps the insides of houses apart."""
+    """Free space below a lid at height ``lid_m``, which separates the insides of houses."""
     faces = mesh.faces[solid]
     below = mesh.vertices[faces, 2].min(axis=1) < lid_m
     points, _ = sample_surface(mesh.vertices, faces[below], _FINENESS * _VOXEL_M)

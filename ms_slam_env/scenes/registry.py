@@ -28,7 +28,7 @@ _LARGE = {
     name: f"ms_slam_env.scenes.{name}:{name}"
     for name in ("residential_street", "city_street", "factory_hall")
 }
-_MESH_FILE = "ms_slam_env.scenes.mesh_file:from_file"  # where the name is that of a file
+_MESH_FILE = "ms_slam_env.scenes.mesh_file:from_file"  # if the name is that of a file
 
 POINT = ExtensionPoint(
     "scene",
@@ -39,16 +39,16 @@ POINT = ExtensionPoint(
 )
 
 ROOMS: tuple[str, ...] = tuple(_ROOMS)
-"""Names of the scenes the size of a room."""
+"""Names of room-sized scenes."""
 
 PUBLISHED_ROOMS = ("living_room", "corridor", "window", "table", "wall", "carpet")
-"""Those that published commands take by default; a new room does not widen what they say."""
+"""Default rooms of published commands; adding a room does not change their results."""
 
 HOMES: tuple[str, ...] = tuple(_HOMES)
-"""Names of the scenes of several rooms: slow to build the first time (10 s), then kept on disk."""
+"""Names of multi-room scenes: slow to build the first time (10 s), then cached on disk."""
 
 LARGE_SCENES: tuple[str, ...] = tuple(_LARGE)
-"""Names of the streets and the hall: farther than a Kinect sees, slow to build (5 to 12 s)."""
+"""Names of the streets and the hall: larger than a Kinect's range, slow to build (5 to 12 s)."""
 
 SCENES: tuple[str, ...] = tuple(POINT.own)
 """Names of the procedural scenes; the first is the default."""
@@ -66,10 +66,10 @@ _MOST_OWN_SEEDS = 100_000
 
 
 def seeds_of(text: str) -> Sequence[int]:
-    """The seeds of a split, or one's own: numbers and ranges, as 7000-7003 or 7000,7005,8000-8009.
+    """Parse the name of a split, or numbers and ranges, as 7000-7003 or 7000,7005,8000-8009.
 
     Raises:
-        InputError: no split, and no such numbers; more than 100,000, or one that is named twice.
+        InputError: neither a split nor such numbers; more than 100,000, or a repeated one.
     """
     if isinstance(text, str) and text in SEED_SPLITS:
         return SEED_SPLITS[text]
@@ -89,7 +89,7 @@ def seeds_of(text: str) -> Sequence[int]:
 
 
 def split_of(seed: int) -> str | None:
-    """Name of the split that ``seed`` belongs to, None if it is in none."""
+    """Name of the split that ``seed`` belongs to, or None."""
     return next((name for name, seeds in SEED_SPLITS.items() if seed in seeds), None)
 
 
@@ -98,30 +98,30 @@ SceneName = str | Callable[[int], Scene]
 
 
 def is_mesh_file(name: object) -> bool:
-    """Whether ``name`` is meant as a mesh file.
+    """Whether ``name`` denotes a mesh file.
 
     Raises:
-        InputError: it is, with options that there are not.
+        InputError: it does, but with unknown options.
     """
     return MeshFile.named(name) is not None
 
 
 def check_name(name: object) -> None:
-    """Refuse what is neither a scene's name nor a mesh file that is there.
+    """Refuse anything but the name of a scene or an existing mesh file.
 
     Raises:
-        InputError: listing the valid choices.
+        InputError: it lists the valid choices.
     """
     if (file := MeshFile.named(name)) is not None:
         file.check_exists()
     elif isinstance(name, str) and ":" not in name and name not in POINT.names():
         raise POINT.unknown(name, (f"the path of a mesh file ({', '.join(MESH_SUFFIXES)})",))
-    elif name not in SCENES:  # ours are there; to import one takes a while
+    elif name not in SCENES:  # built-in scenes need no check; importing one takes a while
         POINT.find(name)
 
 
 def name_of(scene: SceneName) -> str:
-    """A scene's name; of a function, that function's."""
+    """A scene's name; for a function, the function's name."""
     return str(getattr(scene, "__name__", scene))
 
 
@@ -132,8 +132,8 @@ def make(name: SceneName | Path = "living_room", seed: int = 0) -> Scene:
         name: one of ``SCENES``, an entry point (group ``ms_slam_env.scenes``) or
             ``module:function``, a function of the seed, or a mesh file, such as ``room.obj`` or
             ``room.glb,up=z``.
-        seed: varies layout, sizes, colours, textures and lights of a procedural scene, and the
-            lamps of a mesh file; not negative.
+        seed: varies layout, sizes, colours, textures and lights of a procedural scene, or the lamps
+            of a mesh file; not negative.
 
     Raises:
         InputError: an unknown name, a bad seed, a mesh file that is missing, unreadable, without

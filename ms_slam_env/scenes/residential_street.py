@@ -21,7 +21,7 @@ _NAMES = ("ELM ST", "OAK AVE", "PARK RD", "MILL LN", "HILL ST", "LAKE RD")
 
 @dataclass(frozen=True)
 class _Kinds:
-    """Kinds of things in the quarter."""
+    """Shared materials and kinds of objects in the quarter."""
 
     houses: houses.Finishes
     leaves: tuple[Material, ...]
@@ -32,8 +32,8 @@ class _Kinds:
 def residential_street(seed: int) -> LargeScene:
     """Build the quarter of ``seed``.
 
-    Blocks of 18 to 19.5 by 16 to 17 m from one street to the next, smaller than real ones so
-    that a way around them is short. Places: the nine crossings, "SW" to "NE", with "C" between.
+    Blocks of 18 to 19.5 by 16 to 17 m from one street to the next, smaller than real ones so that
+    routes around them are short. Places: the nine crossings, "SW" to "NE", with "C" between.
     """
     rng = np.random.default_rng([seed, 11])
     dx, dy = rng.uniform(18.0, 19.5, 2), rng.uniform(16.0, 17.0, 2)

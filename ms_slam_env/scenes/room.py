@@ -1,4 +1,4 @@
-"""A room: floor, ceiling, walls with or without a window, skirting, and their finishes."""
+"""Box-shaped rooms: floor, ceiling, walls, windows, skirting boards, and their finishes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Window:
     """A window in a wall.
 
     Attributes:
-        along: middle along the wall, metres from the wall's middle, to the right seen from inside.
+        along: position of its centre, metres from the wall's centre, to the right seen from inside.
         sill: height of its lower edge, metres.
         width: metres.
         height: metres.
@@ -40,7 +40,7 @@ class Opening:
     """A doorway in a wall, from the floor up.
 
     Attributes:
-        along: middle along the wall, as a window's.
+        along: position of its centre along the wall, as for a window.
         width: metres.
         height: metres.
     """
@@ -75,7 +75,7 @@ class Room:
         return build.frame(origin + np.array([along * c + gap * s, along * s - gap * c, z]), yaw)
 
     def wall_frame(self, wall: int) -> tuple[Float64, float]:
-        """Middle of a wall's lower edge (3,), and the turn of its frame about z."""
+        """Centre (3,) of a wall's lower edge, and its frame's rotation about z."""
         w, d, _ = self.size
         origin = [(w / 2, d, 0), (w, d / 2, 0), (w / 2, 0, 0), (0, d / 2, 0)][wall]
         return np.array(origin, dtype=np.float64), (0.0, -np.pi / 2, np.pi, np.pi / 2)[wall]
@@ -99,7 +99,7 @@ class Room:
     ) -> None:
         """Add floor, ceiling, walls ("wall 0" to "wall 3"), windows and skirting boards.
 
-        Windows and doorways of a wall lie beside one another; what fills a doorway is not added.
+        Windows and doorways in a wall must not overlap; doors are not added.
         """
         w, d, h = self.size
         with build.object("floor"):
@@ -138,7 +138,7 @@ class Room:
 
 
 def _hole(opening: Window | Opening) -> tuple[float, float, float, float]:
-    """From where to where along the wall, and from which height to which."""
+    """Range along the wall, and range of heights."""
     low = opening.sill if isinstance(opening, Window) else 0.0
     half = opening.width / 2
     return opening.along - half, opening.along + half, low, low + opening.height
@@ -147,7 +147,7 @@ def _hole(opening: Window | Opening) -> tuple[float, float, float, float]:
 def _between(
     length: float, holes: Sequence[tuple[float, float, float, float]]
 ) -> list[tuple[float, float]]:
-    """The pieces of a wall, from where to where, that have no hole in them."""
+    """Ranges of a wall without a hole."""
     ends = [-length / 2, *(end for hole in sorted(holes) for end in hole[:2]), length / 2]
     return list(zip(ends[::2], ends[1::2], strict=True))
 
@@ -178,13 +178,13 @@ def add_window(build: MeshBuilder, window: Window) -> None:
 
 
 def floor_material(build: MeshBuilder, rng: Rng) -> Material:
-    """Wooden planks, 2 x 1.2 m of them."""
+    """Wooden planks; the texture covers 2 x 1.2 m."""
     tone = interior.TONES[rng.integers(len(interior.TONES))]
     return build.material(interior.planks(rng, tone), (2.0, 1.2))
 
 
 def wall_colour(rng: Rng) -> Float64:
-    """Return a quiet light paint."""
+    """Draw a muted light paint colour."""
     return hsv(
         rng.choice([0.09, 0.12, 0.16, 0.3, 0.55, 0.6]),
         rng.uniform(0.04, 0.22),
@@ -193,7 +193,7 @@ def wall_colour(rng: Rng) -> Float64:
 
 
 def wall_material(build: MeshBuilder, rng: Rng, colour: Float64, papered: bool) -> Material:
-    """Plaster in ``colour``; if ``papered``, wallpaper or brick instead."""
+    """Make plaster in ``colour``, or wallpaper or brick if ``papered``."""
     if not papered:
         return build.material(interior.plaster(rng, colour), (2.0, 2.0))
     if rng.random() < 0.25:

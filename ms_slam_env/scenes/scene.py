@@ -1,4 +1,4 @@
-"""What a scene is: textured, lit geometry with free space, start poses and true surface."""
+"""The scene interface: textured, lit geometry with free space, start poses and true surface."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ms_slam_env._runtime.arrays import Bool, Float32, Float64, Int32
 Rng = np.random.Generator
 
 _FLOOR = "floor"
-_MET_M = 0.02  # closer than this to a surface is on it
+_MET_M = 0.02  # points closer to a surface than this are on it
 
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """Triangles with texture, object label and baked light.
+    """A triangle mesh with textures, object labels and baked light.
 
     The radiance leaving a surface point is diffuse: linear(albedo texel) * irradiance, where the
     irradiance (ambient, sun or lamps with shadows) was computed once per face corner.
@@ -46,25 +46,25 @@ class TexturedMesh:
 
 
 class Scene(ABC):
-    """A world that a camera can look at and move in."""
+    """A world in which a camera can move."""
 
     name: str
     seed: int
     mesh: TexturedMesh
     exposure: float  # factor from linear radiance to sensor value before the sRGB curve
     gaze_m: float = 2.4
-    """How far away the things are, at most, that a hand-held camera looks at."""
+    """Largest distance of the things that a hand-held camera looks at."""
     gaze_gap_m: float = 0.05
-    """How much of the line of sight to them need not be free, before their surface."""
+    """Length of the line of sight, just before their surface, that need not be free."""
     clearance_grid_m: float = 0.05
-    """Distance within which ``clearance`` may be short of a surface's true one: a grid's edge."""
+    """Largest error by which ``clearance`` may be too small: a grid's edge."""
     passage_m: float = np.inf
-    """Width of the narrowest passages that ways lead through."""
+    """Width of the narrowest passages on walking routes."""
     lanes: tuple[tuple[Float64, Float64], ...] = ()
-    """Straight ways of cars: points (3,) on the ground where each begins and ends."""
+    """Straight car lanes: start and end points (3,) on the ground."""
 
     def bounds(self) -> tuple[Float64, Float64]:
-        """Least and greatest corner (3,) of the box around all surfaces, metres."""
+        """Lower and upper corner (3,) of the bounding box of all surfaces, metres."""
         vertices = self.mesh.vertices
         return vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
 
@@ -77,14 +77,14 @@ class Scene(ABC):
 
     @abstractmethod
     def segment_is_free(self, start: Float64, end: Float64, radius_m: float) -> bool:
-        """Whether a ball of ``radius_m`` moves from ``start`` (3,) to ``end`` (3,) untouched."""
+        """Whether a ball of ``radius_m`` can move from ``start`` (3,) to ``end`` (3,) freely."""
 
     def segments_are_free(self, start: Float64, ends: Float64, radius_m: float) -> Bool:
-        """Which of ``ends`` (N, 3) a ball of ``radius_m`` reaches from ``start`` (3,), (N,)."""
+        """Which (N,) of ``ends`` (N, 3) a ball of ``radius_m`` can reach from ``start`` (3,)."""
         return np.array([self.segment_is_free(start, end, radius_m) for end in ends], dtype=bool)
 
     def way(self, start: Float64, end: Float64) -> Float64:
-        """Points (K, 3) on the ground along which one gets from one place (3,) to another."""
+        """Walking route (K, 3) on the ground from one point (3,) to another."""
         return np.stack([start, end])
 
     @abstractmethod
@@ -97,14 +97,14 @@ class Scene(ABC):
 
 
 def words(position: Float64) -> str:
-    """A position (3,) to the millimetre."""
+    """Format a position (3,) to the millimetre."""
     return str(np.round(position, 3).tolist())
 
 
 def floor_height(scene: Scene) -> float:
-    """Height of the floor, or of the lowest surface where nothing has that label.
+    """Height of the floor, or of the lowest surface if nothing has that label.
 
-    Each room of several has a floor of its own, as "kitchen floor".
+    In a scene of several rooms each has its own floor, such as "kitchen floor".
     """
     mesh = scene.mesh
     floors = [k for k, name in enumerate(mesh.labels) if name.split(" ")[-1] == _FLOOR]
@@ -115,12 +115,12 @@ def floor_height(scene: Scene) -> float:
 
 
 def outside(scene: Scene, position: Float64) -> str:
-    """How a position (3,) lies outside the box around a scene's surfaces; empty if inside."""
+    """Describe how a position (3,) is outside a scene's bounding box; empty if inside."""
     low, high = scene.bounds()
-    low[2] = floor_height(scene)  # leaves of plants may reach through it
+    low[2] = floor_height(scene)  # plant leaves may extend through it
     if ((position >= low - _MET_M) & (position <= high + _MET_M)).all():
         return ""
-    low, high = (np.round(corner, 2) + 0.0 for corner in (low, high))  # no minus before a zero
+    low, high = (np.round(corner, 2) + 0.0 for corner in (low, high))  # avoids -0.0
     aside = (position[:2] < low[:2] - _MET_M) | (position[:2] > high[:2] + _MET_M)
     if position[2] < low[2] and not aside.any():
         return f"below the floor of scene {scene.name}, which is at z = {low[2]:.2f} m"
@@ -129,7 +129,7 @@ def outside(scene: Scene, position: Float64) -> str:
 
 
 def enclosed(scene: Scene, position: Float64) -> str:
-    """How a position (3,) is in no free space: outside a scene or in something; empty if free."""
+    """Describe why a position (3,) is not free: outside or inside something; empty if free."""
     if scene.clearance(position[None])[0] > 0:
         return ""
     return outside(scene, position) or f"inside something in scene {scene.name}"

@@ -21,7 +21,7 @@ from ms_slam_env.scenes.textures.noise import hsv
 
 _LAMP_GLOW = {"ceiling lamp": (4.0, 3.8, 3.4)}
 _CLEAR = frozenset({"ceiling lamp", PANE})  # cast no shadow
-CELL_M = 0.07  # finer light than in a room, for the camera is near
+CELL_M = 0.07  # finer light than in a room, because the camera is near
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def begin(
 
 
 def ceiling_light(setting: Setting, rng: Rng, x: float, y: float) -> Panel:
-    """Lamp at the ceiling above (x, y), label "ceiling lamp"."""
+    """Add a ceiling lamp above (x, y), with the label "ceiling lamp"."""
     h = setting.room.size[2]
     with setting.build.frame((x, y, h)):
         decor.ceiling_lamp(setting.build, 0.4, 0.4, "ceiling lamp")
@@ -79,7 +79,7 @@ def finish(
     key: float = 0.2,
     start_objects: int = 2,
 ) -> MeshScene:
-    """Bake the light, expose for what lies around ``target`` (3,), and return the scene."""
+    """Bake the light, expose for the surroundings of ``target`` (3,), and return the scene."""
     focus = np.asarray(target, dtype=np.float64).reshape(1, 3)
     mesh, exposure = light_and_expose(setting.build, Lighting(lights, glow, _CLEAR), focus, key)
     w, d, h = setting.room.size
@@ -98,11 +98,11 @@ def orbit(
     """Start poses around a setting.
 
     Args:
-        target: (3,) middle of the setting.
+        target: (3,) centre of the setting.
         distance_m: range of the distance to the point looked at.
         elevation: range of the angle above the horizontal, radians.
-        azimuth: greatest turn from the direction to the front, -y, radians.
-        jitter_m: by which the point looked at moves along each axis.
+        azimuth: largest rotation away from the front, -y, radians.
+        jitter_m: largest shift of the point looked at, per axis.
     """
     middle = np.asarray(target, dtype=np.float64)
 
@@ -183,7 +183,7 @@ def table(seed: int) -> MeshScene:
 
 
 def clutter(build: MeshBuilder, rng: Rng, width: float, depth: float) -> None:
-    """Put things on the rectangle [-width/2, width/2] x [-depth, 0] at z = 0."""
+    """Place objects on the rectangle [-width/2, width/2] x [-depth, 0] at z = 0."""
     with build.frame((rng.uniform(-0.2, 0.2), -0.3 * depth, 0), yaw=rng.uniform(-0.25, 0.25)):
         small_things.laptop(build, rng, "laptop")
     makers: dict[str, tuple[Callable[..., None], float]] = {
@@ -199,7 +199,7 @@ def clutter(build: MeshBuilder, rng: Rng, width: float, depth: float) -> None:
         "second cup": (small_things.cup, 0.05),
     }
     names = list(makers)
-    front = -0.3 * depth - 0.27  # the laptop stands behind this line, in the middle
+    front = -0.3 * depth - 0.27  # the laptop stands behind this line, at the centre
     regions = {
         "left": ((-width / 2, -depth), (-0.2, 0.0)),
         "right": ((0.2, -depth), (width / 2, 0.0)),
@@ -256,7 +256,7 @@ _SKY = 9.0  # radiance of the sky in the units of the baked light; the desk gets
 
 
 def window(seed: int) -> MeshScene:
-    """Build the window of ``seed``: pane saturates the sensor, objects on the sill stand dark."""
+    """Build the window of ``seed``: the pane saturates the sensor, objects on the sill are dark."""
     rng = np.random.default_rng([seed, 4])
     height = rng.uniform(0.72, 0.76)
     opening = Window(

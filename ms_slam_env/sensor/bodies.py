@@ -1,4 +1,4 @@
-"""Things that move through the scene while the sensor looks."""
+"""Rigid bodies that move through the scene during a capture."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from ms_slam_env.sensor.textures import face_planes
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid thing that moves.
+    """A moving rigid body.
 
     Attributes:
-        label: name of the object that it is, or is part of.
-        mesh: in the body's frame; ``irradiance`` is the share of the light around that reaches a
-            corner.
-        pose: gives T_world_body (..., 4, 4) at times (...) in seconds.
-        light: gives the light (4, 3) around the body at a time: what arrives at a surface with
-            unit normal n (world) is max(light[0] + n @ light[1:], 0), linear RGB.
+        label: name of the object it belongs to.
+        mesh: mesh in the body's frame; ``irradiance`` is the share of the surrounding light that
+            reaches each corner.
+        pose: function that returns T_world_body (..., 4, 4) at times (...) in seconds.
+        light: function that returns the light (4, 3) around the body at a time: a surface with unit
+            normal n (world) receives max(light[0] + n @ light[1:], 0), linear RGB.
     """
 
     label: str
@@ -38,7 +38,7 @@ class Body:
 
 
 def joined(scene: TexturedMesh, bodies: Sequence[Body]) -> TexturedMesh:
-    """The triangles of a scene and, after them, of bodies in their own frames, in one mesh."""
+    """Join a scene's triangles and, after them, the bodies' in their own frames into one mesh."""
     labels = list(scene.labels)
     meshes = [scene, *(body.mesh for body in bodies)]
     face_labels = [scene.face_label]
@@ -77,16 +77,16 @@ def corner_normals(mesh: TexturedMesh) -> NDArray[np.float32]:
 
 
 class BodyCast:
-    """Casts the rays of an image in the frame of a body.
+    """Casts the rays of an image in a body's frame.
 
     Attributes:
         body: the body.
         faces: its faces in the joined mesh.
         normals: (F, 3) unit normals in the body's frame.
-        planes: (F,) offsets of the faces' planes, likewise.
-        corner_normals: (F, 3, 3) smooth ones.
-        hits: what the last cast met.
-        T_world_body: (4, 4) in the middle of the image that was cast last.
+        planes: (F,) offsets of the faces' planes in the body's frame.
+        corner_normals: (F, 3, 3) smooth unit normals at the corners.
+        hits: hits of the last cast.
+        T_world_body: (4, 4) at the middle of the last image.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class BodyCast:
         poses: int,
         device: str,
     ) -> None:
-        """Prepare for an image (1, H, W) with so many poses."""
+        """Prepare for an image (1, H, W) with ``poses`` poses."""
         self.body = body
         self.faces = slice(first_face, first_face + len(body.mesh.faces))
         self.normals, self.planes = face_planes(body.mesh)
@@ -114,7 +114,7 @@ class BodyCast:
         self._edges = _frustum(camera)
 
     def cast(self, T_world_camera: Float64, T_world_body: Float64) -> bool:
-        """Cast the rays of poses (P, 4, 4); False, and no rays, if the body is out of sight."""
+        """Cast the rays of poses (P, 4, 4); False without casting if the body is out of view."""
         self.T_world_body = T_world_body[len(T_world_body) // 2]
         T_body_camera = invert(T_world_body) @ T_world_camera
         middle = (invert(T_body_camera) @ self._middle)[:, :3]
@@ -126,7 +126,7 @@ class BodyCast:
 
 
 def _frustum(camera: Pinhole) -> Float64:
-    """Inward unit normals (5, 3) of the planes that bound what an image sees."""
+    """Inward unit normals (5, 3) of the planes that bound the image's view."""
     left, right = (np.array([-0.5, camera.width - 0.5]) - camera.cx) / camera.fx
     top, bottom = (np.array([-0.5, camera.height - 0.5]) - camera.cy) / camera.fy
     if camera.bent.shape[0] > 0:

@@ -1,4 +1,4 @@
-"""Ray casting against the triangles of a scene: what the ray of each pixel meets first."""
+"""Ray casters: find the first scene triangle along each pixel's ray."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ms_slam_env.sensor.rays import Hits, Pinhole, cast_rays, generate_rays
 
 
 class RayCaster(ABC):
-    """Finds the first triangle that the ray of each pixel meets."""
+    """Finds the first triangle along each pixel's ray."""
 
     @abstractmethod
     def bind(
@@ -31,9 +31,9 @@ class RayCaster(ABC):
     ) -> Callable[[], None]:
         """Return a function that casts the rays of images (B, H, W) and overwrites ``hits``.
 
-        There are poses mat44 (B,); where ``camera.rows`` rows share one, as many an image as that
-        makes, of an even number of rows, because two rows are cast together. They are read anew
-        at each call.
+        ``poses`` (B,) are mat44, one per image. With a rolling shutter each group of
+        ``camera.rows`` rows has its own pose; that number must be even, because two rows are cast
+        together. The poses are read at each call.
         """
 
 
@@ -64,7 +64,7 @@ class EmbreeRayCaster(RayCaster):
 
 
 class EmbreeSingleRayCaster(RayCaster):
-    """Intel Embree on the CPU, one ray at a time, through embreex's own interface."""
+    """Intel Embree on the CPU, one ray at a time, through embreex's interface."""
 
     def __init__(self, mesh: TexturedMesh) -> None:
         """Build Embree's acceleration structure."""

@@ -1,4 +1,4 @@
-"""What changes from frame to frame in what one image sees: bodies that move, light."""
+"""Changes from frame to frame in one image's view: moving bodies and light."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ms_slam_env.sensor.casters import RayCaster
 from ms_slam_env.sensor.rays import Hits, Pinhole, keep_nearer
 from ms_slam_env.sensor.shading import Surfaces
 
-_GATHER = 0.2  # of the way from a corner to the middle of its face: there light is gathered
+_GATHER = 0.2  # light is sampled this share of the way from a corner to its face's centre
 _LIFT_M = 0.006
 
 
@@ -24,30 +24,30 @@ class ChangingLight(ABC):
     """Light that changes over time.
 
     Attributes:
-        is_added: whether there is any beside the scene's own.
+        is_added: whether it adds light to the scene's own.
     """
 
     is_added: bool = True
 
     @abstractmethod
     def level(self, time_s: float) -> float:
-        """Factor > 0 on all light that the scene has by itself."""
+        """Factor > 0 on all of the scene's own light."""
 
     @abstractmethod
     def added(self, points: Float64, normals: Float64, time_s: float) -> Float32 | None:
-        """Light (N, 3) beside it at points (N, 3) with unit normals (N, 3); None = nowhere."""
+        """Additional light (N, 3) at points (N, 3) with unit normals (N, 3); None = nowhere."""
 
 
 class ChangingView:
-    """The changes in what a single image sees; owns what of the surfaces changes.
+    """Changes in the view of a single image; owns the changing surface arrays.
 
     Attributes:
-        surfaces: of the joined mesh, with arrays of its own for what changes.
+        surfaces: surfaces of the joined mesh, with private arrays for what changes.
         posed_face: (H * W,) index into ``normal`` and ``plane`` of the face that a pixel sees.
-        normal: unit normals, of a body's faces once for every pose of the image.
-        plane: offsets of the faces' planes, likewise.
-        exposure_factor: on the exposure of the next image.
-        first_face: of the bodies' in the joined mesh.
+        normal: unit normals; those of bodies' faces once per pose of the image.
+        plane: offsets of the faces' planes; those of bodies once per pose.
+        exposure_factor: factor on the exposure of the next image.
+        first_face: index of the bodies' first face in the joined mesh.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class ChangingView:
         hits: Hits,
         device: str,
     ) -> None:
-        """Prepare for one image; ``mesh`` is the scene's and the bodies', joined."""
+        """Prepare for one image; ``mesh`` joins those of the scene and the bodies."""
         self._mesh, self._light, self._camera, self._hits = mesh, light, camera, hits
         self._device = device
         self._is_cpu = device == "cpu"
@@ -100,7 +100,7 @@ class ChangingView:
         return [_Rows(array, self.first_face, self._moving_faces) for array in arrays]
 
     def look(self, cast_scene: Callable[[], None], T: Float64, times_s: Float64) -> None:
-        """Find what the image from poses T (P, 4, 4) at times (P,) sees, and how it is lit."""
+        """Cast the image from poses T (P, 4, 4) at times (P,), and update its light."""
         cast_scene()
         middle = float(times_s[len(times_s) // 2])
         if self._bodies:
@@ -138,7 +138,7 @@ class ChangingView:
         self._light_of_bodies.upload()
 
     def _add_light(self, light: ChangingLight, time_s: float) -> None:
-        """Add light to the faces in sight; those of the last image lose theirs."""
+        """Add light to the visible faces, and remove it from those of the last image."""
         static = self._lit[self._lit < self.first_face]
         irradiance = self.surfaces.irradiance.numpy()
         irradiance[static] = self._mesh.irradiance[static]
@@ -148,11 +148,11 @@ class ChangingView:
         added = light.added(points, normals, time_s)
         if added is not None:
             irradiance[self._lit] += added.reshape(-1, 3, 3) / self.exposure_factor
-        if not self._is_cpu:  # there the array above is the real one
+        if not self._is_cpu:  # on the CPU the array above shares the memory
             self.surfaces.irradiance.assign(irradiance)
 
     def _gathering_points(self) -> tuple[Float64, Float64]:
-        """Places (3 N, 3) just in front of the corners of the lit faces, and normals (3 N, 3)."""
+        """Points (3 N, 3) just in front of the lit faces' corners, and normals (3 N, 3)."""
         faces = self._lit
         corners = self._mesh.vertices[self._mesh.faces[faces]].astype(np.float64)
         normal = self.surfaces.normal.numpy()[faces].astype(np.float64)
@@ -166,26 +166,26 @@ class ChangingView:
 
 
 class _Rows:
-    """The bodies' rows, at the end of an array of the surfaces, to be written as NumPy.
+    """The bodies' rows at the end of a surface array, writable as NumPy.
 
     Attributes:
-        values: (P, F, ...) of F faces, once for each of P poses; on the CPU the array itself.
+        values: (P, F, ...) of F faces, once per pose; on the CPU the array itself.
     """
 
     def __init__(self, array: wp.array, first: int, faces: int) -> None:
-        """Take the rows from ``first`` on."""
+        """Select the rows from ``first`` on."""
         self._rows = array[first:]
         rows = self._rows.numpy()
         self.values = rows.reshape(-1, faces, *rows.shape[1:])
 
     def upload(self) -> None:
-        """Bring what was written to where the array lies."""
+        """Copy the written values to the array's device."""
         if not self._rows.device.is_cpu:
             self._rows.assign(self.values.reshape(-1, *self.values.shape[2:]))
 
 
 def _arriving(cast: BodyCast, R: Float64, time_s: float) -> Float64:
-    """Light (F, 3, 3) at the corners of a body that is turned by R (3, 3)."""
+    """Light (F, 3, 3) that arrives at the corners of a body rotated by R (3, 3)."""
     around = cast.body.light(time_s)
     arriving = around[0] + cast.corner_normals @ (R.T @ around[1:])
     return np.maximum(arriving, 0.0) * cast.body.mesh.irradiance

@@ -1,4 +1,4 @@
-"""Depth as a structured-light sensor measures it; for the sources [K] and [N] see noise.py."""
+"""Depth measured by a structured-light sensor; for the sources [K] and [N] see noise.py."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ def projector_shadow(
     noise: DepthNoise,
     shadow: wp.array[wp.uint8],  # (B * H * W,)
 ) -> None:
-    """Mark what the projector, right of the camera, does not reach; one thread per image row.
+    """Mark pixels that the projector, right of the camera, does not reach; one thread per row.
 
-    The projector sees a point of native column c and depth z in its own column c - f b / z. Along
-    a row these columns must ascend: where one does not, a nearer surface to the right hides it.
+    The projector sees a point of native column c and depth z in its column c - f b / z. Along a row
+    these columns must ascend: where one does not, a nearer surface to the right hides it.
     """
     row = wp.tid()
     nearest = float(_NOTHING)

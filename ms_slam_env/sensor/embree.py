@@ -1,10 +1,11 @@
-"""Intel Embree's C interface, of the library that embreex brings along.
+"""Intel Embree's C interface, from the library shipped with embreex.
 
-embreex itself offers one ray at a time; packets of eight rays, which share the walk through the
-hierarchy, need the functions below. Names and constants are those of embree4/rtcore.h.
+embreex itself casts one ray at a time. Packets of eight rays, which traverse the hierarchy
+together, need the functions below. Names and constants are those of embree4/rtcore.h.
 
-Embree divides by approximate reciprocals, whose last bits differ among processors, and SLAM makes
-millimetres of them. So Embree says which face a ray meets; where on it is computed here.
+Embree divides by approximate reciprocals, whose last bits differ among processors, and in SLAM that
+grows to millimetres. So Embree only finds the face that a ray hits; the position on it is computed
+here.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from ms_slam_env.sensor.rays import Hits, Pinhole, pose_of_row
 
 PACKET_FUNCTION = "rtcIntersect8"
 DEVICE = b"threads=1,max_isa=avx2"
-"""Embree's devices: kernels of one kind on every processor with AVX2, so that a ray at an edge
-meets the same face (those for AVX-512 cast packets of eight 6 % faster)."""
+"""Embree's device options: the same kernels on every processor with AVX2, so that a ray at an edge
+hits the same face (AVX-512 kernels cast packets of eight 6 % faster)."""
 _VERSION_MAJOR = 4
 _RTC_DEVICE_PROPERTY_VERSION_MAJOR = 1
 _RTC_GEOMETRY_TYPE_TRIANGLE = 0
@@ -33,7 +34,7 @@ _RTC_BUFFER_TYPE_INDEX = 0
 _RTC_BUFFER_TYPE_VERTEX = 1
 _RTC_FORMAT_UINT3 = 0x5003
 _RTC_FORMAT_FLOAT3 = 0x9003
-_RTC_SCENE_FLAG_ROBUST = 1 << 2  # as embreex: no ray slips through between two triangles
+_RTC_SCENE_FLAG_ROBUST = 1 << 2  # as in embreex: no ray passes between two adjacent triangles
 _P, _I, _U, _N = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint, ctypes.c_size_t
 _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "rtcNewDevice": (_P, [ctypes.c_char_p]),
@@ -53,10 +54,10 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
 
 @lru_cache(maxsize=1)
 def embree_library() -> ctypes.CDLL | None:
-    """Embree 4 with the types of its functions declared; None where it cannot be reached.
+    """Load Embree 4 with its function types declared; None if it cannot be found.
 
-    The extension module is opened, not the library: where the loader also searches what a library
-    depends on (Linux, macOS) that finds Embree wherever its wheel has put it.
+    It opens the extension module instead of the library. On Linux and macOS the loader also
+    searches a library's dependencies, and so finds Embree wherever the wheel installed it.
     """
     library = ctypes.CDLL(rtcore_scene.__file__)
     try:
@@ -73,7 +74,7 @@ def embree_library() -> ctypes.CDLL | None:
 
 
 class PacketScene:
-    """Triangles in an Embree scene of their own, built on one thread.
+    """An Embree scene of triangles, built on one thread.
 
     Attributes:
         scene: address of the RTCScene.
@@ -108,7 +109,7 @@ class PacketScene:
         self.intersect: int = function.value or 0
 
     def __del__(self) -> None:
-        """Give the scene back."""
+        """Release the scene."""
         self._library.rtcReleaseScene(self.scene)
         self._library.rtcReleaseDevice(self._device)
 
@@ -144,7 +145,7 @@ def cast_tiles(
     camera: Pinhole,
     hits: Hits,  # of B * H * W rays
 ) -> None:
-    """First hit of the ray of each pixel; face -1 where there is none; one thread a tile."""
+    """Find the first hit of each pixel's ray; face -1 if there is none; one thread per tile."""
     b, y, x = wp.tid()
     T = T_world_camera[pose_of_row(camera, b, 2 * y)]  # the rows of a tile share their pose
     _cast_tile(intersect, scene, vertices, faces, T, camera, b, y, x, hits)

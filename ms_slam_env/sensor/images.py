@@ -1,4 +1,4 @@
-"""The arrays of a number of images and the launches that fill them, recorded once."""
+"""Image buffers and the recorded kernel launches that fill them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ms_slam_env.sensor.textures import (
 
 
 def upload_surfaces(mesh: TexturedMesh, device: str) -> Surfaces:
-    """What shading needs to know of a mesh, on the device."""
+    """Upload the mesh data that shading needs."""
     textures = pack_textures(mesh.textures)
     normals, planes = face_planes(mesh)
     surfaces = Surfaces()
@@ -47,7 +47,7 @@ def upload_surfaces(mesh: TexturedMesh, device: str) -> Surfaces:
 
 
 def upload_tables(device: str) -> Tables:
-    """The tables of shading and noise, on the device."""
+    """Upload the tables for shading and noise."""
     tables = Tables()
     tables.normals = wp.array(normal_table(), dtype=wp.float32, device=device)
     tables.decode = wp.array(decode_table(), dtype=wp.float32, device=device)
@@ -57,7 +57,7 @@ def upload_tables(device: str) -> Tables:
 
 @dataclass(frozen=True)
 class Changes:
-    """What changes from frame to frame in a scene, and the mesh of all there is, joined."""
+    """What changes from frame to frame in a scene, and the joined mesh of scene and bodies."""
 
     mesh: TexturedMesh
     bodies: Sequence[Body]
@@ -66,7 +66,7 @@ class Changes:
 
 
 class Images:
-    """Arrays for a number of images and the work on them, overwritten from call to call.
+    """Buffers for a batch of images and the kernels that fill them, overwritten by each call.
 
     Packing the arguments of a launch in Python costs more than a small kernel, so the launches are
     recorded. One thread at a time may use an object.
@@ -87,8 +87,8 @@ class Images:
     ) -> None:
         """Allocate the arrays for images (B, H, W) and record the launches.
 
-        ``camera.rows`` says how many rows of an image have a pose of their own. With ``changes``
-        there is one image.
+        ``camera.rows`` is the number of consecutive rows that share a pose. With ``changes`` there
+        is one image.
         """
         self._device = device
         self._shape = shape
@@ -141,7 +141,7 @@ class Images:
         self._measure.append(RecordedLaunch(measure_depth, parts, inputs, device))
 
     def _look(self, poses: NDArray[np.float64], times_s: NDArray[np.float64] | None) -> None:
-        """Find what the images from poses (P, 4, 4) see."""
+        """Cast the rays of the images from poses (P, 4, 4)."""
         self._poses.write(poses)
         if self._view is None:
             self._cast()
@@ -160,7 +160,7 @@ class Images:
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Noisy colour (B, H, W, 3) and depth (B, H, W) from poses (P, 4, 4) with keys (B, 2).
 
-        ``times_s`` (P,), of the poses, matters only where something changes.
+        ``times_s`` (P,) are the poses' times; they matter only if something changes.
         """
         self._keys.write(keys)
         self._look(poses, times_s)

@@ -1,4 +1,4 @@
-"""What the sensor's native kernels share: compiler flags, spans, keys of random numbers."""
+"""Shared parts of the sensor's native kernels: compiler flags, spans, random keys."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from scipy.special import ndtri
 from ms_slam_env.errors import InputError
 
 VECTOR_FLAGS = {"cpu_compiler_flags": "-march=native"}
-"""Options of a module whose native loops vectorise; Warp's default flags keep Clang from it."""
+"""Module options that let native loops vectorise; Warp's default flags prevent it."""
 
 
 def span_of(width: int, device: str) -> int:
-    """Pixels a thread does of a row of ``width`` pixels."""
+    """Number of pixels that one thread processes in a row of ``width`` pixels."""
     return width if device == "cpu" else 1
 
 
 NORMAL_STEPS = 65536
-"""Entries of the table of the normal distribution's quantiles."""
+"""Number of entries in the table of normal quantiles."""
 
 
 def normal_table() -> NDArray[np.float32]:
-    """Quantiles (65536,) of N(0, 1) at the midpoints; a table costs less than Box and Muller."""
+    """Quantiles (65536,) of N(0, 1) at midpoints; a table is cheaper than Box-Muller."""
     return ndtri((np.arange(NORMAL_STEPS) + 0.5) / NORMAL_STEPS).astype(np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Noise of RGB-D sensors (Kinect v1, Xtion; a camera for longer ranges): parameters, variants."""
+"""Noise models of RGB-D sensors: Kinect v1 and Xtion, a longer-range camera, no noise."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError, unknown
 
 NATIVE_WIDTH = 640
-"""Width in pixels of the physical sensor; its disparity is quantised there for every size."""
+"""Width in pixels of the physical sensor; disparity is always quantised at this width."""
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,16 @@ class NoiseConfig(Checked):
     Attributes:
         baseline_m: distance between projector and camera [K].
         disparity_step_px: step of the measured disparity at 640 pixels [K]; 0 = not quantised.
-        axial: factor on the depth noise [N]. [N] measured quantised depth, so the variance of
-            the quantisation is taken off before this noise is added: the sum is as published.
+        axial: factor on the depth noise [N]. [N] measured quantised depth, so the quantisation's
+            variance is subtracted first: the sum is as published.
         lateral: factor on the jitter of the image position at which depth is sampled [N].
-        grazing_start_deg: incidence angle from which readings drop out; [N] found none beyond 80.
-        grazing_end_deg: incidence angle from which all readings drop out.
+        grazing_start_deg: incidence angle above which readings start to drop out; [N] found none
+            beyond 80.
+        grazing_end_deg: incidence angle above which all readings drop out.
         edge_dropout: probability that a pixel beside a depth edge has no reading.
-        edge_jump_px: disparity jump (640 pixels) between neighbours that is a depth edge.
-        shadow: 1 = surfaces that the projector does not reach have no reading, 0 = they have.
+        edge_jump_px: disparity jump between neighbours, at 640 pixels, that counts as a depth edge.
+        shadow: 1 = no reading on surfaces that the projector does not reach, 0 = readings there
+            too.
         min_range_m: nearest reading; [N] measured from 0.4 m.
         max_range_m: farthest reading; [K] measured up to 5 m.
         shot: variance of the linear intensity per unit of intensity [F].
@@ -60,7 +62,7 @@ class NoiseConfig(Checked):
     read: float = bounded(2e-3, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Refuse values out of range, and ends that lie before their starts."""
+        """Refuse values out of range, and ends before their starts."""
         super().__post_init__()
         if self.grazing_end_deg < self.grazing_start_deg:
             raise InputError(
@@ -76,7 +78,7 @@ class NoiseConfig(Checked):
 
 @dataclass(frozen=True)
 class NoNoise(NoiseConfig):
-    """The ideal sensor: every visible surface is read exactly, at any distance and angle."""
+    """An ideal sensor that measures every visible surface exactly, at any distance and angle."""
 
     disparity_step_px: float = 0.0
     axial: float = 0.0
@@ -93,13 +95,13 @@ class NoNoise(NoiseConfig):
 
 @dataclass(frozen=True)
 class RangeNoise(NoiseConfig):
-    """A depth camera for streets and halls: reads up to 12 m, at a quarter of the Kinect's noise.
+    """A depth camera for streets and halls, up to 12 m, with a quarter of the Kinect's noise.
 
-    A Kinect sees 5 m and is blind in the sun. This one stands for a laser camera or wide stereo:
-    no steps of disparity and no shadow of a projector; head-on 0.5 mm of noise at 1 m, 10 mm at
-    5 m, 64 mm at 12 m (0.25 of [N], whose formula was measured up to 3 m and is extrapolated);
-    fewer readings lost at edges, none beyond 88 degrees of incidence. It is a model, no measured
-    device.
+    A Kinect sees 5 m and is blind in sunlight. This one represents a laser camera or wide-baseline
+    stereo: no disparity steps and no projector shadow. Head-on the noise is 0.5 mm at 1 m, 10 mm at
+    5 m and 64 mm at 12 m (0.25 of [N], whose formula was measured up to 3 m and is extrapolated).
+    Fewer readings are lost at edges, and there are none beyond 88 degrees of incidence. It is a
+    model, not a measured device.
     """
 
     disparity_step_px: float = 0.0
@@ -126,14 +128,14 @@ _STRENGTHS = ("disparity_step_px", "axial", "lateral", "edge_dropout", "shot", "
 
 
 def noise_config(noise: str | NoiseConfig | Mapping[str, Any]) -> NoiseConfig:
-    """Return the configuration of a noise model given by name, as options, or directly.
+    """Return the configuration of a noise model given by name, by options, or directly.
 
-    Options are ``name`` (kinect by default), ``strength``, a factor on everything of the model that
-    is random or quantised (at most to the end of each range), and fields of ``NoiseConfig``, which
-    take precedence.
+    Options are ``name`` (kinect by default), ``strength``, and fields of ``NoiseConfig``, which
+    take precedence. ``strength`` scales everything random or quantised in the model, up to the end
+    of each range.
 
     Raises:
-        InputError: an unknown name or option, a value out of range, or something else.
+        InputError: an unknown name or option, a value out of range, or an unsupported type.
     """
     if isinstance(noise, NoiseConfig):
         return noise

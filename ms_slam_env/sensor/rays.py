@@ -1,6 +1,6 @@
 # mypy: disable-error-code="attr-defined"
 # Warp's stubs do not name the fields of a ray query.
-"""Kernels that make viewing rays and cast them, and the pinhole camera as a Warp struct."""
+"""Kernels that generate and cast viewing rays, and the pinhole camera as a Warp struct."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ms_slam_env.camera import Intrinsics
 
 @wp.struct
 class Pinhole:
-    """Intrinsics for kernels, in pixels, and how many rows of an image share a pose.
+    """Intrinsics for kernels, in pixels, and the number of rows that share a pose.
 
-    With a lens the rays are those of a table, not of focal length and centre.
+    With lens distortion, rays come from a table instead of focal length and centre.
     """
 
     fx: wp.float32
@@ -23,8 +23,8 @@ class Pinhole:
     cy: wp.float32
     width: wp.int32
     height: wp.int32
-    rows: wp.int32  # that share a pose; ``height`` unless the shutter rolls
-    bent: wp.array[wp.vec2]  # (H * W,) x and y at z = 1; empty without a lens
+    rows: wp.int32  # rows that share a pose; ``height`` unless the shutter rolls
+    bent: wp.array[wp.vec2]  # (H * W,) x and y at z = 1; empty without distortion
 
 
 @wp.struct
@@ -33,12 +33,12 @@ class Hits:
 
     t: wp.array[wp.float32]  # (N,) ray parameter: the depth; undefined where face is -1
     u: wp.array[wp.float32]  # (N,) barycentric weight of the face's second corner
-    v: wp.array[wp.float32]  # (N,) and of its third
-    face: wp.array[wp.int32]  # (N,) index of the face, -1 where the ray meets nothing
+    v: wp.array[wp.float32]  # (N,) barycentric weight of its third corner
+    face: wp.array[wp.int32]  # (N,) index of the face; -1 if the ray hits nothing
 
 
 def make_hits(count: int, device: str) -> Hits:
-    """Room for the hits of so many rays."""
+    """Allocate hits for ``count`` rays."""
     hits = Hits()
     hits.t, hits.u, hits.v = (wp.zeros(count, dtype=wp.float32, device=device) for _ in range(3))
     hits.face = wp.zeros(count, dtype=wp.int32, device=device)
@@ -46,10 +46,10 @@ def make_hits(count: int, device: str) -> Hits:
 
 
 def make_pinhole(intrinsics: Intrinsics, rows: int | None = None, device: str = "cpu") -> Pinhole:
-    """Copy intrinsics into the struct; every ``rows`` rows have a pose, by default all one.
+    """Copy intrinsics into the struct; each ``rows`` rows share a pose, by default all rows.
 
     Raises:
-        InputError: the lens leads no ray in front of the camera to some pixel.
+        InputError: some pixel has no ray in front of the camera under this distortion.
     """
     pinhole = Pinhole()
     pinhole.fx, pinhole.fy = intrinsics.fx, intrinsics.fy
@@ -79,7 +79,7 @@ def rotate(T: wp.mat44, d: wp.vec3) -> wp.vec3:
 
 @wp.func
 def world_ray(T: wp.mat44, camera: Pinhole, x: int, y: int) -> wp.vec3:
-    """Direction in the world of a pixel; one unit of it is one metre of depth."""
+    """World direction of a pixel's ray, scaled to one metre of depth."""
     if camera.bent.shape[0] > 0:
         ray = camera.bent[y * camera.width + x]
         return rotate(T, wp.vec3(ray[0], ray[1], 1.0))
@@ -100,7 +100,7 @@ def generate_rays(
     origins: wp.array[wp.vec3],  # (B * H * W,)
     directions: wp.array[wp.vec3],  # (B * H * W,)
 ) -> None:
-    """One ray per pixel."""
+    """Generate one ray per pixel."""
     b, y, x = wp.tid()
     T = T_world_camera[pose_of_row(camera, b, y)]
     i = (b * camera.height + y) * camera.width + x
@@ -115,7 +115,7 @@ def cast_rays(
     camera: Pinhole,
     hits: Hits,  # of B * H * W rays
 ) -> None:
-    """First hit of the ray of each pixel; face -1 where there is none."""
+    """Find the first hit of each pixel's ray; face -1 if there is none."""
     b, y, x = wp.tid()
     T = T_world_camera[pose_of_row(camera, b, y)]
     i = (b * camera.height + y) * camera.width + x
@@ -140,7 +140,7 @@ def keep_nearer(
     hits: Hits,  # of H * W rays
     posed_face: wp.array[wp.int32],
 ) -> None:
-    """Where a body is hit before anything else, its hit takes the place of the other."""
+    """Replace hits by those on a body where the body is nearer."""
     _, y, x = wp.tid()
     i = y * camera.width + x
     hit = found.face[i]

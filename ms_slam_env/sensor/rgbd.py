@@ -25,10 +25,10 @@ from ms_slam_env.sensor.noise import NoiseConfig, noise_config
 from ms_slam_env.sensor.rays import make_pinhole
 
 FRAME_RATE_HZ = 30.0
-"""Rate of the simulated sensor; gives a frame its time stamp when the caller does not."""
+"""Rate of the simulated sensor; sets a frame's time stamp if the caller gives none."""
 
 ROLLING_ROWS = 2
-"""Rows of an image that a rolling shutter exposes together."""
+"""Number of rows that a rolling shutter exposes together."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class TrueView:
     Attributes:
         color: (H, W, 3) uint8 without noise.
         depth: (H, W) float32 metres along the optical axis; 0 = no surface.
-        normals: (H, W, 3) float32 unit vectors in the camera frame, towards the camera; 0 = none.
+        normals: (H, W, 3) float32 unit vectors in the camera frame, facing the camera; 0 = none.
         labels: (H, W) int32 index into the mesh's labels; -1 = no surface.
         points: (H, W, 3) float32 in the world frame; 0 = no surface.
     """
@@ -54,22 +54,21 @@ _BATCH_SIZES_KEPT = 8  # buffers for one image of 160x120 take half a megabyte
 
 
 class _OfThread(threading.local):
-    """What each thread has of a sensor for itself."""
+    """Per-thread data of a sensor."""
 
     def __init__(self) -> None:
         self.images: dict[tuple[int, bool], Images] = {}  # by number of images, rolling or not
         self.last: Images | None = None
 
 
-_RECORDING = threading.Lock()  # loading and recording kernels is Warp's business, one at a time
+_RECORDING = threading.Lock()  # Warp loads and records kernels one at a time
 
 
 class RGBDSensor:
     """A colour and depth camera in a scene.
 
-    The noise of a frame is a function of (seed, index, pixel) alone: the order of the calls and
-    the batch in which a frame is rendered do not matter. Several threads may use one sensor: each
-    has buffers of its own.
+    The noise of a frame is a function of (seed, index, pixel) alone: the order of calls and the
+    batch of a frame do not matter. Several threads may use one sensor; each has its own buffers.
     """
 
     def __init__(
@@ -87,13 +86,13 @@ class RGBDSensor:
 
         Args:
             scene: the world; its mesh is copied to the device once.
-            intrinsics: of both images, which are registered; a lens bends both.
+            intrinsics: intrinsics of both images, which are registered; distortion applies to both.
             noise: "kinect", "none" or a NoiseConfig.
-            seed: of the noise.
+            seed: noise seed.
             device: Warp device, such as "cpu" or "cuda:0".
-            caster: what finds the ray hits; by default the fastest of the device.
-            bodies: things that move in it; each is where it is at the time of the frame.
-            light: how its light changes; None leaves it as it is.
+            caster: ray caster; by default the fastest one for the device.
+            bodies: moving bodies, placed according to the frame's time.
+            light: how the scene's light changes; None leaves it constant.
 
         Raises:
             InputError: unknown noise model, or a seed that is not an integer >= 0.
@@ -131,9 +130,9 @@ class RGBDSensor:
 
         Args:
             T_world_camera: pose of the camera.
-            index: counter of the noise: the same index and seed give the same noise.
+            index: noise counter: the same index and seed give the same noise.
             timestamp: seconds; index / 30 Hz by default.
-            seed: of the noise, in place of the sensor's own.
+            seed: noise seed; the sensor's own by default.
 
         Raises:
             InputError: a pose that is not a finite rigid motion, or a bad index or seed.
@@ -153,13 +152,13 @@ class RGBDSensor:
 
         Args:
             T_world_camera: poses of the camera.
-            indices: counters of the noise, one a pose.
-            seed: of the noise, in place of the sensor's own.
+            indices: noise counters, one per pose.
+            seed: noise seed; the sensor's own by default.
             timestamps: (B,) seconds; index / 30 Hz by default.
 
         Raises:
             InputError: a pose that is not a finite rigid motion, a bad index, seed or time stamp,
-                or as many indices or time stamps as there are not poses.
+                or a number of indices or time stamps that differs from that of the poses.
         """
         poses = np.asarray(T_world_camera, dtype=np.float64)
         if len(poses) != len(indices) or len(poses) == 0:
@@ -181,7 +180,7 @@ class RGBDSensor:
 
     @property
     def rolling_poses(self) -> int:
-        """Number of poses of an image whose shutter rolls: one for every two rows."""
+        """Number of poses per rolling-shutter image: one for every two rows."""
         return -(-self.intrinsics.height // ROLLING_ROWS)
 
     def capture_rolling(
@@ -192,20 +191,20 @@ class RGBDSensor:
         seed: int | None = None,
         row_times_s: ArrayLike | None = None,
     ) -> RGBDFrame:
-        """Take frame ``index`` with a rolling shutter: every two rows have a pose of their own.
+        """Take frame ``index`` with a rolling shutter: every two rows have their own pose.
 
         With equal poses it is the frame of ``capture``, bit for bit.
 
         Args:
             T_world_camera: (rolling_poses, 4, 4), from the top row to the bottom.
-            index: counter of the noise.
+            index: noise counter.
             timestamp: seconds; index / 30 Hz by default.
-            seed: of the noise, in place of the sensor's own.
-            row_times_s: (rolling_poses,) when, for what moves or changes by itself; by default all
-                at the time stamp.
+            seed: noise seed; the sensor's own by default.
+            row_times_s: (rolling_poses,) seconds, for moving bodies and changing light; the time
+                stamp by default.
 
         Raises:
-            InputError: another number of poses or times, a pose that is not a finite rigid motion,
+            InputError: a wrong number of poses or times, a pose that is not a finite rigid motion,
                 or a bad index, seed or time stamp.
         """
         poses = self._check_rolling(np.asarray(T_world_camera, dtype=np.float64)[None])
@@ -221,11 +220,11 @@ class RGBDSensor:
     ) -> NDArray[np.uint8]:
         """Noise-free colour (B, H, W, 3) from poses (B, rolling_poses, 4, 4).
 
-        One pose for every two rows, as in ``capture_rolling``; ``times_s`` (B, rolling_poses) says
-        when, for what moves or changes by itself.
+        One pose for every two rows, as in ``capture_rolling``; ``times_s`` (B, rolling_poses) are
+        the times for moving bodies and changing light.
 
         Raises:
-            InputError: another shape, or a pose that is not a finite rigid motion.
+            InputError: a wrong shape, or a pose that is not a finite rigid motion.
         """
         poses = np.asarray(T_world_camera, dtype=np.float64)
         flat = self._check_rolling(poses)
@@ -237,7 +236,7 @@ class RGBDSensor:
         return np.concatenate([images.ideal_colors(*one).copy() for one in each])
 
     def _check_rolling(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Poses (B * rolling_poses, 4, 4) of poses (B, rolling_poses, 4, 4)."""
+        """Check poses (B, rolling_poses, 4, 4), and flatten them to (B * rolling_poses, 4, 4)."""
         if poses.ndim != 4 or poses.shape[1:] != (self.rolling_poses, 4, 4) or len(poses) == 0:
             raise InputError(
                 f"a rolling shutter of {self.intrinsics.height} rows needs poses "
@@ -245,7 +244,7 @@ class RGBDSensor:
             )
         flat = poses.reshape(-1, 4, 4)
         R = flat[:, :3, :3]
-        is_rigid = (  # of all at once; one after the other would cost more than rendering
+        is_rigid = (  # all at once; one by one would cost more than rendering
             (np.abs(R @ R.swapaxes(1, 2) - np.eye(3)) < 1e-4).all()
             and (np.linalg.det(R) > 0).all()
             and (flat[:, 3] == (0, 0, 0, 1)).all()
@@ -256,7 +255,7 @@ class RGBDSensor:
         return flat
 
     def with_noise(self, noise: str | NoiseConfig) -> RGBDSensor:
-        """The same sensor with another noise; both look at the same copy of the scene.
+        """Copy this sensor with another noise model; both share the scene's data.
 
         Raises:
             InputError: unknown noise model.
@@ -269,14 +268,14 @@ class RGBDSensor:
 
     @property
     def caster(self) -> RayCaster:
-        """What finds the ray hits in the scene."""
+        """The ray caster."""
         return self._caster
 
     def last_true_depth(self, moving: bool = True) -> NDArray[np.float32]:
         """True depth (H, W) of the frame that this thread captured last, metres; 0 = no surface.
 
-        Without ``moving`` bodies that move count as no surface.
-        Costs no second ray cast. Other users of the same sensor in the same thread overwrite it.
+        Unless ``moving``, moving bodies count as no surface. Needs no second ray cast. Later
+        captures of this sensor in the same thread overwrite it.
 
         Raises:
             InputError: nothing was captured yet.
@@ -322,7 +321,7 @@ class RGBDSensor:
 
 
 def _times_of(times_s: ArrayLike | None, count: int, default: float) -> NDArray[np.float64]:
-    """Times (count,) of poses."""
+    """Times (count,) of the poses."""
     if times_s is None:
         return np.full(count, default)
     times = np.asarray(times_s, dtype=np.float64).ravel()

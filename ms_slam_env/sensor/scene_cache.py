@@ -1,4 +1,4 @@
-"""Scenes and their sensors, built once a process and shared by its environments."""
+"""Cache of scenes and sensors, built once per process and shared by its environments."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.noise import NoiseConfig
 
 FACES_KEPT = 1_000_000
-"""Faces of all scenes that are kept, the last one used in any case.
+"""Most faces of all cached scenes; the last one used is always kept.
 
-With textures, trees and surfaces a room of 50,000 faces takes 35 to 75 MB, a home of 180,000 some
-250 MB: at most 1.5 GB for 20 rooms or five homes, in each of the processes of a training.
+With textures, trees and surfaces a room of 50,000 faces takes 35 to 75 MB, and a home of 180,000
+faces about 250 MB: at most 1.5 GB for 20 rooms or five homes in each training process.
 """
 
 SENSORS_KEPT = 2
-"""Of a scene, those used last: a curriculum draws noise for each episode."""
+"""Most recently used sensors kept per scene: a curriculum draws noise for each episode."""
 
 _kept: OrderedDict[tuple[SceneName, int], tuple[Scene, dict[Any, RGBDSensor]]] = OrderedDict()
 _lock = RLock()
 
 
 def get_scene(name: SceneName, seed: int) -> Scene:
-    """The scene ``name`` with ``seed``; built at the first call, and where it is no longer kept."""
+    """Get the scene ``name`` with ``seed``, built unless cached."""
     return _place(name, seed)[0]
 
 
 def get_sensor(
     name: SceneName, seed: int, intrinsics: Intrinsics, noise: str | NoiseConfig
 ) -> RGBDSensor:
-    """A sensor looking at that scene; its noise seed is set by each environment."""
+    """Get a sensor in that scene; each environment sets its noise seed."""
     with _lock:
         scene, sensors = _place(name, seed)
         key = intrinsics, noise
@@ -52,7 +52,7 @@ def get_sensor(
 
 
 def _place(name: SceneName, seed: int) -> tuple[Scene, dict[Any, RGBDSensor]]:
-    """A scene and its sensors; those longest not asked for go where there are too many faces."""
+    """Get a scene and its sensors; evict the least recently used if there are too many faces."""
     key = name, seed
     with _lock:
         if key not in _kept:

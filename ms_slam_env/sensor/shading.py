@@ -1,4 +1,4 @@
-"""Colour of what each ray hits: texture, baked light, exposure, intensity noise, sRGB.
+"""Colour at each ray hit: texture, baked light, exposure, intensity noise, sRGB.
 
 [F]: Foi et al., "Practical Poissonian-Gaussian Noise Modeling and Fitting for Single-Image
 Raw-Data", IEEE TIP 2008.
@@ -19,7 +19,7 @@ wp.set_module_options(VECTOR_FLAGS)
 
 @wp.struct
 class Surfaces:
-    """What shading needs to know of a mesh, per face or per texture."""
+    """Mesh data for shading, per face or per texture."""
 
     uv: wp.array2d[wp.vec2]  # (F, 3)
     irradiance: wp.array2d[wp.vec3]  # (F, 3)
@@ -35,7 +35,7 @@ class Surfaces:
 
 @wp.struct
 class Tables:
-    """Functions of one number, tabulated."""
+    """Lookup tables."""
 
     normals: wp.array[wp.float32]  # quantiles of N(0, 1)
     decode: wp.array[wp.float32]  # sRGB to linear
@@ -109,11 +109,11 @@ def true_geometry(
     hits: Hits,  # of B * H * W rays
     surfaces: Surfaces,
     depth: wp.array[wp.float32],  # (B * H * W,)
-    normals: wp.array[wp.vec3],  # camera frame, towards the camera
+    normals: wp.array[wp.vec3],  # camera frame, facing the camera
     labels: wp.array[wp.int32],
     points: wp.array[wp.vec3],  # world frame
 ) -> None:
-    """Write depth, normal, label and point of each hit; 0 and label -1 where there is none."""
+    """Write depth, normal, label and point of each hit; 0 and label -1 if there is none."""
     b, y, x = wp.tid()
     i = (b * camera.height + y) * camera.width + x
     face = hits.face[i]

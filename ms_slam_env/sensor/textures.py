@@ -1,4 +1,4 @@
-"""Mip pyramids of all textures of a mesh, packed into one array, and the sRGB tables."""
+"""Mip pyramids of a mesh's textures, packed into one array, and the sRGB tables."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ENCODE_STEPS = 4096
 
 
 def decode_table() -> Float32:
-    """Linear intensity of the 8-bit sRGB values 0 to 255, the last one repeated, (257,)."""
+    """Linear intensity (257,) of the 8-bit sRGB values 0 to 255, the last one repeated."""
     table = srgb_to_linear(np.arange(256) / 255.0)
     return np.append(table, table[-1]).astype(np.float32)
 
@@ -75,7 +75,7 @@ def pack_textures(textures: tuple[NDArray[np.uint8], ...]) -> PackedTextures:
 
 
 def face_planes(mesh: TexturedMesh) -> tuple[Float32, Float32]:
-    """Unit normal n (F, 3) and offset n . x (F,) of each face's plane, outside = positive."""
+    """Unit normal n (F, 3) and offset n . x (F,) of each face's plane, positive outside."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = face_cross(corners)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
@@ -84,7 +84,7 @@ def face_planes(mesh: TexturedMesh) -> tuple[Float32, Float32]:
 
 
 def texel_density(mesh: TexturedMesh) -> Float32:
-    """Texels of level 0 per metre (F,) on each face: root of the ratio of the two areas."""
+    """Level-0 texels per metre (F,) on each face: square root of the ratio of the two areas."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     area = np.linalg.norm(face_cross(corners), axis=1)
     sizes = np.array([texture.shape[1::-1] for texture in mesh.textures], dtype=np.float64)

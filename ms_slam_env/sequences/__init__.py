@@ -1,6 +1,6 @@
 """RGB-D sequences: recordings on disk, camera paths, rendering with perturbations, files.
 
-By name, as every command takes it: a folder, or scene:seed[:word[+word ...]] (``naming``)::
+By name, as in every command: a folder, or scene:seed[:word[+word ...]] (``naming``)::
 
     sequence = open_sequence("living_room:2000:kinect+misregistration", "320x240")
 

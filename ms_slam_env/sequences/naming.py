@@ -1,18 +1,18 @@
-"""One way to name a sequence, for all commands: the folder of a recording, or a generated one.
+"""Sequence names shared by all commands: a recording's folder, or a rendered sequence.
 
-``FOLDER[,FOLDER ...]`` is a recording, in one part or several that follow each other; a ROS bag or
-an MCAP file stands for a folder.
+``FOLDER[,FOLDER ...]`` is a recording in one or several consecutive parts; a ROS bag or an MCAP
+file counts as a folder.
 
 ``scene:seed[:word[+word ...]]``: a scene (a name or a mesh file), the seed of scene, path, noise
-and perturbations, then in any order the noise of the sensor, the path of the camera and what
-perturbs the frames, each with options if it has any::
+and perturbations, then in any order (but noise before perturbations) the sensor noise, the camera
+path and the perturbations, each with its options, if any::
 
     living_room:2000
     living_room:2000:none
     living_room:2000:kinect+misregistration+motion-blur,exposure_s=0.02
     small_house.glb,up=z:7:uneven,frames=120+depth-dropout
 
-What is left out is Kinect noise, the path that the command has for its sequences, and nothing.
+The defaults are Kinect noise, the command's path, and no perturbations.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ PATHS: dict[str, type[CameraPath]] = {
     "segments": MotionSegments,
     "wander": WanderingPath,
 }
-"""Word to path of the camera; ``steady`` is the older word for ``handheld``."""
+"""Camera path of each word; ``steady`` is the older word for ``handheld``."""
 
 RENDERED_SIZE = "160x120"
-"""Image size of a rendered sequence where none is asked for."""
+"""Default image size of a rendered sequence."""
 
 _GRAMMAR = (
     "is neither a folder nor scene:seed[:word[+word ...]], such as table:2000, table:2000:none or "
@@ -68,14 +68,14 @@ _GRAMMAR = (
 
 @dataclass(frozen=True)
 class SequenceName:
-    """A rendered sequence, as it was named.
+    """The parsed name of a rendered sequence.
 
     Attributes:
-        scene: its name, or a mesh file.
-        seed: of scene, path, noise and perturbations.
-        noise: of the sensor.
-        perturbations: applied in this order.
-        path: word of the camera's path; None leaves it to the command.
+        scene: name of the scene, or a mesh file.
+        seed: seed of scene, path, noise and perturbations.
+        noise: noise model of the sensor.
+        perturbations: perturbations in the order of application.
+        path: word of the camera path; None leaves it to the command.
         path_options: options of that path.
     """
 
@@ -87,7 +87,7 @@ class SequenceName:
     path_options: Mapping[str, Any] = field(default_factory=dict)
 
     def camera_path(self, default: CameraPath) -> CameraPath:
-        """The path: ``default`` where none is named; as many frames as that where none are said."""
+        """The camera path: ``default``, or the named one with the default's frames unless given."""
         if self.path is None:
             return default
         frames = getattr(default, "frames", None)
@@ -96,11 +96,11 @@ class SequenceName:
 
 
 def parse_sequence(text: str | Path) -> SequenceName | Path:
-    """What ``text`` names: a folder, or a rendered sequence.
+    """Parse the name of a sequence: a folder, or a rendered sequence.
 
     Raises:
-        InputError: neither; an unknown word (the message lists what may stand there), or a bad
-            option. Scenes are checked where they are made, or by `check_sequence`.
+        InputError: neither; an unknown word (the message lists the valid ones), or a bad option.
+            Scenes are checked when made, or by `check_sequence`.
     """
     if all(is_recording(part) for part in part_folders(text)):
         return Path(text)
@@ -115,13 +115,13 @@ def parse_sequence(text: str | Path) -> SequenceName | Path:
 
 
 def _with_word(named: SequenceName, word: str, text: str) -> SequenceName:
-    """``named`` with one word more; a noise model stands before the perturbations or nowhere."""
+    """Add one word to ``named``; a noise model must precede the perturbations."""
     name, options = parse_named(word, f"part of sequence {text!r}")
     if name in NOISE_MODELS and not options and not named.perturbations:
         return dataclasses.replace(named, noise=name)
     if name in PATHS and named.path is None:
         made = dataclasses.replace(named, path=name, path_options=options)
-        made.camera_path(HandheldPath())  # refuses bad options here
+        made.camera_path(HandheldPath())  # refuses bad options
         return made
     if not is_reference(name) and name not in POINT.names():
         free = () if named.path else PATHS
@@ -132,10 +132,10 @@ def _with_word(named: SequenceName, word: str, text: str) -> SequenceName:
 
 
 def check_sequence(text: str | Path) -> None:
-    """Refuse, before any work is done, what `open_sequence` with ``with_truth`` would refuse.
+    """Check a name before any work; refuses whatever `open_sequence` ``with_truth`` would.
 
     Raises:
-        InputError: as `parse_sequence`; an unknown scene, no recording, or one without truth.
+        InputError: as `parse_sequence`; an unknown scene, not a recording, or one without truth.
     """
     named = parse_sequence(text)
     if isinstance(named, SequenceName):
@@ -156,24 +156,24 @@ def open_sequence(
     register: bool | Registration | None = None,
     topics: Topics | None = None,
 ) -> Sequence:
-    """The sequence that ``name`` names; frames are decoded or rendered when they are asked for.
+    """Open the sequence ``name``; frames are decoded or rendered on request.
 
     Args:
         name: a folder, or ``scene:seed[:word[+word ...]]`` as this module describes.
-        image_size: such as 160x120, or 160x120+crop for the central part of that aspect
-            (`ms_slam_env.camera.image_size`); ``native`` or None: that of the images on disk, of
-            rendered ones `RENDERED_SIZE`.
-        path: of the camera of rendered sequences whose names do not say it; hand-held by default.
+        image_size: such as 160x120, or 160x120+crop for the central part with that aspect ratio
+            (`ms_slam_env.camera.image_size`); ``native`` or None: the size on disk, or
+            `RENDERED_SIZE` for rendered sequences.
+        path: camera path of rendered sequences whose names contain none; hand-held by default.
         every: take every n-th frame.
-        with_truth: leave out frames whose true pose is not known, and refuse a recording that has
-            no two others. Otherwise their ``poses`` are NaN.
-        layout: of the folder, as `open_recording` takes it; so are the next two.
-        intrinsics: of the images on disk.
-        register: whether colour is brought into the depth camera.
-        topics: of a bag.
+        with_truth: leave out frames without a known true pose, and refuse a recording with fewer
+            than two others. Otherwise their ``poses`` are NaN.
+        layout: layout of the folder; see `open_recording`, also for the next three.
+        intrinsics: intrinsics of the images on disk.
+        register: whether to register colour to the depth camera.
+        topics: topics of a bag.
 
     Raises:
-        InputError: a sequence that cannot be made or read; ``every`` below 1.
+        InputError: the sequence cannot be made or read; ``every`` is below 1.
     """
     if every < 1:
         raise InputError(f"every = {every} must be at least 1")

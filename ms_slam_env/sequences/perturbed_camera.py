@@ -1,4 +1,4 @@
-"""A camera with imperfections, on any path: what a rendered sequence and an environment share."""
+"""An imperfect camera on any path, shared by rendered sequences and environments."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from ms_slam_env.sequences.perturbations.perturbation import (
 )
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 
-_METERING_WIDTH = 40  # images whose brightness is what an exposure control goes by
+_METERING_WIDTH = 40  # columns of the images that exposure control measures
 
 
 @dataclasses.dataclass(frozen=True)
 class Imperfections:
-    """Perturbations by what they change, each kind in the order in which it was given."""
+    """Perturbations sorted by what they change, each kind in the given order."""
 
     motion: tuple[MotionPerturbation, ...]
     selection: tuple[FrameSelection, ...]
@@ -46,10 +46,10 @@ class Imperfections:
 
     @staticmethod
     def of(perturbations: Iterable[Perturbation]) -> Imperfections:
-        """Sort them.
+        """Sort perturbations.
 
         Raises:
-            InputError: something that is no perturbation, or two of the light.
+            InputError: something is not a perturbation, or two change the light.
         """
         given = tuple(perturbations)
         kinds = (
@@ -69,7 +69,7 @@ class Imperfections:
         return Imperfections(*sorted_out)  # type: ignore[arg-type]
 
     def optics_of(self, intrinsics: Intrinsics) -> Optics:
-        """How a camera takes its frames."""
+        """The optics of a camera with these imperfections."""
         optics = Optics(intrinsics)
         for perturbation in self.optics:
             optics = perturbation.alter(optics)
@@ -78,10 +78,10 @@ class Imperfections:
     def movers(
         self, scene: Scene, path: PoseInterpolation, intrinsics: Intrinsics, seed: int
     ) -> list[Mover]:
-        """What moves through the scene while the camera is on its path.
+        """The objects that move through the scene while the camera follows its path.
 
         Raises:
-            InputError: no free way, or two objects of one name.
+            InputError: no free route, or two objects with one name.
         """
         movers: list[Mover] = []
         for perturbation in self.world:
@@ -94,16 +94,16 @@ class Imperfections:
     def changing_light(
         self, scene: Scene, path: PoseInterpolation, intrinsics: Intrinsics, seed: int
     ) -> ChangingLight | None:
-        """How the light changes; None as it is."""
+        """How the light changes; None if it does not."""
         return next((p.light(scene, path, intrinsics, seed) for p in self.light), None)
 
 
 class PerturbedCamera:
-    """Takes frames with imperfect optics of a scene in which things move and the light changes.
+    """Captures frames with imperfect optics in a scene with moving objects and changing light.
 
     Attributes:
-        sensor: of a perfect camera at the place of the depth camera.
-        lens: of the depth camera, and of that of colour.
+        sensor: sensor of a perfect camera at the depth camera's pose.
+        lens: distortion of the depth and the colour camera.
     """
 
     def __init__(
@@ -120,14 +120,14 @@ class PerturbedCamera:
         """Prepare to render.
 
         Args:
-            scene: where.
-            intrinsics: of the frames.
-            noise: of the sensor.
-            imperfections: those of the optics and of the images are used.
-            movers: what moves through the scene.
-            light: how its light changes.
-            sensor: one that looks at the scene already; used if nothing moves or changes there.
-            caster: of the rays in the scene.
+            scene: the scene.
+            intrinsics: intrinsics of the frames.
+            noise: noise model of the sensor.
+            imperfections: those of optics and images are used.
+            movers: objects that move through the scene.
+            light: how the scene's light changes.
+            sensor: an existing sensor in the scene; used if nothing moves or changes there.
+            caster: ray caster for the scene.
 
         Raises:
             InputError: unknown noise model.
@@ -171,14 +171,14 @@ class PerturbedCamera:
         seed: int,
         brightness: Callable[[], Float64],
     ) -> RGBDFrame:
-        """Take a frame at a time on a path.
+        """Capture a frame at a time on a path.
 
         Args:
-            path: of the camera around that time.
+            path: the camera's path around that time.
             time_s: time stamp.
-            index: of the frame, counter of its noise.
-            count: of the frames, for what runs from the first to the last.
-            seed: of noise and perturbations.
+            index: number of the frame; also the counter of its noise.
+            count: number of frames, for perturbations that span the whole sequence.
+            seed: seed of noise and perturbations.
             brightness: see ``Moment``.
         """
         frame = self._take(path, time_s, index, seed)
@@ -188,11 +188,11 @@ class PerturbedCamera:
         return frame
 
     def last_true_depth(self, moving: bool = True) -> NDArray[np.float32]:
-        """True depth (H, W) of the frame that was taken last; see ``RGBDSensor``."""
+        """True depth (H, W) of the last frame; see ``RGBDSensor``."""
         return self._depth_sensor.last_true_depth(moving)
 
     def brightness(self, T_world_camera: Float64, time_s: float) -> float:
-        """Mean intensity in [0, 255] of what is seen from a pose (4, 4) at a time."""
+        """Mean intensity in [0, 255] of the view from a pose (4, 4) at a time."""
         if self._meter is None:
             K = self.sensor.intrinsics
             small = K.scaled(min(1.0, _METERING_WIDTH / K.width))
@@ -201,7 +201,7 @@ class PerturbedCamera:
         return float(intensity_image(color).mean())
 
     def _take(self, path: PoseInterpolation, time_s: float, index: int, seed: int) -> RGBDFrame:
-        """With the optics; the images are not perturbed."""
+        """Capture a frame with the optics, before image perturbations."""
         color = None
         if self._optics.exposure_s:
             color = self._blurred(path, time_s, index, seed)
@@ -220,14 +220,14 @@ class PerturbedCamera:
         seed: int,
         offset: Float64,
     ) -> RGBDFrame:
-        """Frame of one of the two cameras, which stands at ``offset`` in the depth camera."""
+        """Frame of one of the two cameras, at pose ``offset`` in the depth camera's frame."""
         if not self._optics.readout_s:
             return sensor.capture(path(time_s) @ offset, index, time_s, seed)
         times = time_s + self._row_times()
         return sensor.capture_rolling(path(times) @ offset, index, time_s, seed, times)
 
     def _row_times(self) -> Float64:
-        """Times (rolling_poses,) of the rows that share a pose, after the frame's time stamp."""
+        """Times (rolling_poses,) of row groups with one pose, relative to the time stamp."""
         height = self.sensor.intrinsics.height
         first = ROLLING_ROWS * np.arange(self.sensor.rolling_poses)
         last = np.minimum(first + ROLLING_ROWS, height) - 1

@@ -1,4 +1,4 @@
-"""Sequences rendered in a scene, each frame when it is asked for."""
+"""Sequences rendered in a scene, frame by frame on request."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 
 class RenderedFrames(Frames):
-    """Frames of a camera on a trajectory, a function of their index alone; none is kept.
+    """Frames of a camera on a trajectory; each depends on its index alone, and none is stored.
 
     Attributes:
-        kept: (N,) indices of the frames on the trajectory, after a change of its pace.
+        kept: (N,) indices of the frames on the trajectory, after retiming.
         timestamps: (N,) seconds.
-        poses: (N, 4, 4) true T_world_camera, of the depth camera at the time stamp.
-        object_trajectories: name -> (N, 4, 4) T_world_object of each object that moves.
+        poses: (N, 4, 4) true T_world_camera of the depth camera at the time stamp.
+        object_trajectories: (N, 4, 4) T_world_object of each moving object by name.
     """
 
     def __init__(
@@ -41,8 +41,8 @@ class RenderedFrames(Frames):
         """Prepare to render.
 
         Raises:
-            InputError: unknown noise model, a bad seed, something that is no perturbation, or no
-                way for a moving object.
+            InputError: unknown noise model, a bad seed, something that is not a perturbation, or no
+                free route for a moving object.
         """
         random_numbers(seed, name="check of the seed")
         self._seed = seed
@@ -80,7 +80,7 @@ class RenderedFrames(Frames):
         )
 
     def picked(self, indices: NDArray[np.integer]) -> RenderedFrames:
-        """The frames of these numbers (M,) only, each as it was."""
+        """Select the frames with these numbers (M,), unchanged."""
         some = copy.copy(self)
         some.kept, some.timestamps = self.kept[indices], self.timestamps[indices]
         some.poses = self.poses[indices]
@@ -91,14 +91,14 @@ class RenderedFrames(Frames):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Names of the objects in the scene, by the labels of ``truth``."""
+        """Names of the objects in the scene; indexed by the labels of ``truth``."""
         return self._camera.sensor.labels
 
     def truth(self, index: int) -> TrueView:
         """Noise-free view (colour, depth, normals, labels, points) from the true pose of a frame.
 
-        Nothing of it is perturbed: it is what a perfect camera sees at the time stamp, with what
-        moves through the scene and in the light of that moment.
+        It is not perturbed: it shows what a perfect camera sees at the time stamp, including moving
+        objects and the light at that time.
         """
         return self._camera.sensor.ground_truth(self.poses[index], float(self.timestamps[index]))
 
@@ -114,7 +114,7 @@ class RenderedFrames(Frames):
 
 @dataclass(frozen=True)
 class RenderedSequence(Sequence):
-    """A sequence whose frames are rendered when they are asked for.
+    """A sequence whose frames are rendered on request.
 
     Attributes:
         frames: the renderer; ``frames.truth(index)`` is the noise-free view from a frame's pose,
@@ -133,7 +133,7 @@ class RenderedSequence(Sequence):
         return self.frames.truth(index).depth
 
     def picked(self, indices: NDArray[np.integer]) -> RenderedSequence:
-        """The same sequence with the frames of these numbers (M,) only, increasing."""
+        """Select the frames with these numbers (M,), increasing."""
         frames = self.frames.picked(indices)
         return replace(self, frames=frames, poses=frames.poses)
 
@@ -149,22 +149,23 @@ def render_sequence(
     perturbations: Iterable[Perturbation] = (),
     timestamps: ArrayLike | None = None,
 ) -> RenderedSequence:
-    """Take one frame from every pose of a trajectory, less those that a perturbation skips.
+    """Render one frame from every pose of a trajectory, except those that a perturbation skips.
 
     Args:
-        scene: where.
-        trajectory: (N, 4, 4) T_world_camera, of the depth camera.
-        intrinsics: of the frames.
-        noise: of the sensor: "kinect", "none" or a NoiseConfig.
-        seed: of the noise and the perturbations: with the same arguments every frame is the same,
-            bit for bit, in whatever order they are rendered.
-        name: for tables and files.
+        scene: the scene.
+        trajectory: (N, 4, 4) T_world_camera of the depth camera.
+        intrinsics: intrinsics of the frames.
+        noise: noise model of the sensor: "kinect", "none" or a NoiseConfig.
+        seed: seed of noise and perturbations: equal arguments give equal frames, bit for bit, in
+            whatever order they are rendered.
+        name: name for tables and files.
         perturbations: applied in this order; first those that select frames, then those of the
             optics, then those of the images.
         timestamps: (N,) seconds; index / 30 Hz by default.
 
     Raises:
-        InputError: a bad pose, time or seed, an unknown noise model, or no perturbation.
+        InputError: a bad pose, time or seed, an unknown noise model, or something that is not a
+            perturbation.
     """
     poses = np.asarray(trajectory, dtype=np.float64)
     times = np.arange(len(poses)) / FRAME_RATE_HZ if timestamps is None else timestamps

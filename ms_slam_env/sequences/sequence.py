@@ -1,4 +1,4 @@
-"""RGB-D frames with what is known of the poses that they were taken from."""
+"""RGB-D frames with their true poses, as far as known."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ms_slam_env.errors import InputError, InputWarning
 
 
 class Frames(collections.abc.Sequence[RGBDFrame]):
-    """Frames that are rendered or decoded when they are asked for."""
+    """Frames that are rendered or decoded on request."""
 
     @abstractmethod
     def frame(self, index: int) -> RGBDFrame:
@@ -46,15 +46,14 @@ class Sequence:
     Iterating gives pairs (frame, T_world_camera (4, 4)).
 
     Attributes:
-        frames: N frames; those of a rendered or recorded sequence are rendered or decoded when they
-            are asked for, each time anew and always the same. ``tuple(sequence.frames)`` holds
-            them all.
-        poses: (N, 4, 4) float64 true T_world_camera; NaN where it is not known.
-        intrinsics: of all frames.
-        name: for tables and files.
+        frames: N frames; those of a rendered or recorded sequence are rendered or decoded on every
+            request, always with the same result. ``tuple(sequence.frames)`` keeps them all.
+        poses: (N, 4, 4) float64 true T_world_camera; NaN if not known.
+        intrinsics: intrinsics of all frames.
+        name: name for tables and files.
 
     Raises:
-        InputError: numbers of frames and poses that differ.
+        InputError: the numbers of frames and poses differ.
     """
 
     frames: collections.abc.Sequence[RGBDFrame]
@@ -63,7 +62,7 @@ class Sequence:
     name: str
 
     def __post_init__(self) -> None:
-        """Refuse frames without pose."""
+        """Refuse different numbers of frames and poses."""
         if self.poses.shape != (len(self.frames), 4, 4):
             raise InputError(f"{len(self.frames)} frames but poses of shape {self.poses.shape}")
 
@@ -87,25 +86,25 @@ class Sequence:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """(N,) whether the true pose of a frame is known."""
+        """Whether each frame's true pose is known, (N,)."""
         return np.asarray(np.isfinite(self.poses).all(axis=(1, 2)))
 
     @property
     def start(self) -> Float64 | None:
-        """True pose (4, 4) of the first frame; None where it is not known."""
+        """True pose (4, 4) of the first frame; None if not known."""
         return self.poses[0] if self.known[0] else None
 
     def true_trajectory(self) -> tuple[Float64, Float64] | None:
-        """Times (M,) in seconds and true T_world_camera (M, 4, 4), as known; None without any."""
+        """Known times (M,) in seconds and true T_world_camera (M, 4, 4); None if there are none."""
         known = self.known
         return (self.timestamps[known], self.poses[known]) if known.any() else None
 
     def true_depth(self, index: int) -> NDArray[np.float32]:
-        """Depth (H, W) in metres of what frame ``index`` shows, as truly as it is known."""
+        """Best known depth (H, W) in metres of frame ``index``."""
         return self.frames[index].depth
 
     def check_depth(self) -> None:
-        """Refuse frames that show nothing at all.
+        """Refuse a sequence without any depth.
 
         Raises:
             InputError: no frame has a depth reading.
@@ -114,15 +113,15 @@ class Sequence:
             raise InputError(f"sequence {self.name}: no frame has a depth reading")
 
     def picked(self, indices: NDArray[np.integer]) -> Sequence:
-        """The same sequence with the frames of these numbers (M,) only, increasing."""
+        """Select the frames with these numbers (M,), increasing."""
         frames = tuple(self.frames[int(index)] for index in indices)
         return replace(self, frames=frames, poses=self.poses[indices])
 
     def where_known(self) -> Sequence:
-        """The same sequence without the frames whose true pose is not known, which is warned of.
+        """Drop frames without a known true pose, with a warning.
 
         Raises:
-            InputError: fewer than two are left.
+            InputError: fewer than two frames are left.
         """
         known = self.known
         if not known.any():
@@ -136,5 +135,5 @@ class Sequence:
         return self.picked(np.flatnonzero(known))
 
     def said_known(self) -> str:
-        """How many frames have a true pose, in words."""
+        """Describe how many frames have a true pose."""
         return f"{int(self.known.sum())} of {len(self)} frames have a true pose"

@@ -1,4 +1,4 @@
-"""Trajectories: as text in the TUM format, between their samples, and with others' timestamps."""
+"""Trajectories: TUM text format, interpolation, and association by timestamps."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from ms_slam_env.geometry import (
 )
 
 MAX_DIFFERENCE_S = 0.02
-"""Timestamps further apart do not belong together (the tolerance of the TUM tools)."""
+"""Largest difference of associated timestamps (the tolerance of the TUM tools)."""
 
-_MAX_TIME_S = 1e20  # nanoseconds since 1970 among them
+_MAX_TIME_S = 1e20  # allows nanoseconds since 1970
 
 _FIELDS = "timestamp tx ty tz qx qy qz qw"
 
 
 TRAJECTORY_HEADER = f"# {_FIELDS}"
-"""First line of a file of poses."""
+"""First line of a trajectory file."""
 
 UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
-"""Unit of time to its seconds."""
+"""Seconds per unit of time."""
 
 _SAID_UNITS = {
     r"\[ns\]|\bnano_?s": "ns",
@@ -40,20 +40,20 @@ _SAID_UNITS = {
     r"\[ms\]|\bmilli_?s": "ms",
     r"\[s\]|\bsec(ond)?s?\b": "s",
 }
-_CLOCK_S = 9e8, 4.2e9  # since 1970, of a clock that is right
+_CLOCK_S = 9e8, 4.2e9  # plausible range of seconds since 1970
 
 
 def said_unit(comment: str) -> str | None:
-    """The unit of time that a comment names, as in ``#timestamp [ns]``; None if it names none."""
+    """The unit of time in a comment such as ``#timestamp [ns]``; None if there is none."""
     said = (u for form, u in _SAID_UNITS.items() if re.search(form, comment.lower()))
     return next(said, None)
 
 
 def unit_of(times: Float64) -> tuple[str, bool]:
-    """The unit of increasing times (N,) as found in a file, and whether it is guessed.
+    """The unit of increasing times (N,) found in a file, and whether it is a guess.
 
-    Times since 1970 tell their unit. Of others, poses or frames would be minutes apart in a unit
-    that is too long: steps of 2000 are of microseconds, of two million of nanoseconds.
+    Times since 1970 reveal their unit. For others, a unit is too long if poses or frames would be
+    minutes apart: steps of 2000 mean microseconds, steps of two million nanoseconds.
     """
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     for unit in ("ns", "us", "ms"):
@@ -65,12 +65,12 @@ def unit_of(times: Float64) -> tuple[str, bool]:
 
 
 def in_seconds(times: Float64, where: str | Path, said: str | None = None) -> Float64:
-    """Increasing times (N,) of a file in seconds; a unit that is guessed is warned of.
+    """Convert increasing times (N,) of a file to seconds; warn if the unit is a guess.
 
     Args:
-        times: as they stand there.
-        where: for the warning.
-        said: the unit that the file names, if it does.
+        times: times as in the file.
+        where: file name for the warning.
+        said: unit named in the file, if any.
     """
     if len(times) == 0:
         return times
@@ -81,7 +81,7 @@ def in_seconds(times: Float64, where: str | Path, said: str | None = None) -> Fl
 
 
 def say_unit(unit: str, times: Float64, where: str | Path, otherwise: str) -> None:
-    """Warn that the unit of times (N,) is a guess, and what says ``otherwise``."""
+    """Warn that the unit of times (N,) is a guess; ``otherwise`` says how to state it."""
     step = float(np.median(np.diff(times)))
     warnings.warn(
         f"{where}: times are taken as {unit}, since they are {step:.6g} apart; {otherwise} says "
@@ -92,7 +92,7 @@ def say_unit(unit: str, times: Float64, where: str | Path, otherwise: str) -> No
 
 
 def trajectory_line(timestamp: float, T_world_camera: Float64) -> str:
-    """One pose (4, 4) at ``timestamp`` in seconds, without line end."""
+    """Format one pose (4, 4) at ``timestamp`` in seconds, without line end."""
     return _lines(np.array([timestamp]), T_world_camera[None])[0]
 
 
@@ -117,7 +117,7 @@ def write_trajectory(path: str | Path, timestamps: ArrayLike, poses: ArrayLike) 
 
 
 def _check(row: Float64, where: str) -> None:
-    """Raise the error of a line of eight numbers, if there is one."""
+    """Refuse an invalid line of eight numbers."""
     if not np.isfinite(row).all():
         raise InputError(f"{where}: a number is not finite")
     if np.abs(row[1:4]).max() > MAX_COORDINATE_M or abs(row[0]) > _MAX_TIME_S:
@@ -134,8 +134,8 @@ def read_trajectory(path: str | Path) -> tuple[Float64, Float64]:
     A comment may name the unit of time, as ``[ns]``, and the order of the columns.
 
     Raises:
-        InputError: no such file, no pose in it, a line that does not parse, or timestamps that
-            do not increase; the message names file and line.
+        InputError: no such file, no pose in it, an invalid line, or timestamps that do not
+            increase; the message names file and line.
     """
     numbers: list[int] = []
     found: list[list[float]] = []
@@ -183,7 +183,7 @@ def read_trajectory(path: str | Path) -> tuple[Float64, Float64]:
 
 
 def associate(times: Float64, others: Float64, max_difference_s: float) -> tuple[Int64, Int64]:
-    """Pairs of indices of timestamps that are each other's nearest, in order.
+    """Pair timestamps that are mutually nearest; return their indices in order.
 
     Args:
         times: (N,) increasing, seconds.
@@ -200,14 +200,14 @@ def associate(times: Float64, others: Float64, max_difference_s: float) -> tuple
 
 
 def say_few_pairs(where: str | Path, pairs: int, count: int) -> None:
-    """Warn where fewer than half of the depth images have colour of their time."""
+    """Warn if fewer than half of the depth images have a colour image of the same time."""
     if 2 * pairs < count:
         text = f"{where}: only {pairs} of {count} depth images have colour of their time"
         warnings.warn(f"{text}; the others are left out", InputWarning, stacklevel=2)
 
 
 def _nearest(times: Float64, others: Float64) -> Int64:
-    """Index (N,) of the one of ``others`` (M,) nearest to each of ``times`` (N,)."""
+    """Index (N,) of the nearest of ``others`` (M,) to each of ``times`` (N,)."""
     right = np.clip(np.searchsorted(others, times), 1, max(1, len(others) - 1))
     left = right - 1
     right = np.minimum(right, len(others) - 1)
@@ -215,9 +215,9 @@ def _nearest(times: Float64, others: Float64) -> Int64:
 
 
 class PoseInterpolation:
-    """A trajectory at any time: between two samples position and rotation change at constant rate.
+    """Interpolates a trajectory, with constant linear and angular velocity between samples.
 
-    Before the first sample and after the last the motion of the nearest interval goes on. At the
+    Before the first sample and after the last, the motion of the nearest interval continues. At the
     time of a sample the result is that sample, bit for bit.
     """
 
@@ -225,8 +225,8 @@ class PoseInterpolation:
         """Take poses (N, 4, 4) at increasing times (N,).
 
         Raises:
-            InputError: no pose, shapes that do not fit, times that are not finite or do not
-                increase, or a pose that is no rigid motion.
+            InputError: no pose, mismatched shapes, times that are not finite or do not increase, or
+                a pose that is not a rigid motion.
         """
         from scipy.spatial.transform import Rotation
 

@@ -1,14 +1,14 @@
-"""The eight sequences of USME, declared: scene, way, perturbations, sensor.
+"""The eight sequences of USME: scene, path, perturbations, sensor.
 
 Qu, Zhang, Yang, Dong, "USME: unified SLAM measurement and evaluation", Navigation Positioning and
-Timing 2021, section 3, says in words what they are; the cells of its Table 2, and the numbers of
-frames with them, are missing from the text that we have. From the words: residential street and
-city street outdoors, factory hall and room indoors; two like long residential sequences, one
-without loop and one that closes a single large loop at its end; a residential one with three loops
-and the same with motion blur; moving objects in the hall and in the city street, which has no loop;
-fast motion and rotation; black frames put into one of the fast sequences. That the fast ones are
-those of the room, with its bare walls and changing light, is our reading. USME's scenes are
-those of a game engine, its depth is exact; ours are procedural and smaller, the depth is noisy.
+Timing 2021, section 3, describes them in words; the cells of its Table 2, including the numbers of
+frames, are missing from the text available to us. The description: residential street and city
+street outdoors, factory hall and room indoors; two similar long residential sequences, one without
+a loop and one that closes a single large loop at its end; a residential one with three loops and
+the same with motion blur; moving objects in the hall and in the city street, which has no loop;
+fast motion and rotation; black frames inserted into one of the fast sequences. We take the fast
+ones to be those of the room, with its bare walls and changing light. USME's scenes come from a game
+engine and its depth is exact; ours are procedural and smaller, with noisy depth.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ _LIGHT = "illumination,dim=0.4,period_s=8"
 
 @dataclass(frozen=True)
 class UsmeSequence:
-    """One of the sequences.
+    """One of the eight sequences.
 
     Attributes:
-        name: of its folder.
-        scene: where.
-        path: the camera's way.
-        noise: of the sensor.
+        name: name of its folder.
+        scene: name of the scene.
+        path: camera path.
+        noise: noise model of the sensor.
         perturbations: ``NAME,option=value,...``.
-        loops: how often the path comes back to where it was; None where it just wanders.
-        about: in words.
+        loops: number of times the path returns to an earlier place; None if it only wanders.
+        about: description.
     """
 
     name: str
@@ -66,7 +66,7 @@ class UsmeSequence:
     def motion(self, scene: Scene, seed: int, frames_scale: float = 1.0) -> tuple[Float64, Float64]:
         """Times (N,) in seconds and poses T_world_camera (N, 4, 4).
 
-        With ``frames_scale`` below 1 the same way takes fewer frames, so the camera moves faster.
+        With ``frames_scale`` below 1 the same path takes fewer frames, so the camera moves faster.
         """
         if isinstance(self.path, RoutePath):
             return self.path.with_frames_scaled(frames_scale).motion(scene, seed)
@@ -82,7 +82,7 @@ class UsmeSequence:
         return scaled.timestamps, scaled.poses(scene, seed)
 
     def made_perturbations(self, frames_scale: float = 1.0) -> list[Perturbation]:
-        """The perturbations; those that name frames name them at this scale."""
+        """The perturbations, with frame numbers scaled."""
         from ms_slam_env.sequences import make_perturbation
 
         made = []
@@ -175,14 +175,14 @@ SUITE: tuple[UsmeSequence, ...] = (
         loops=None,
     ),
 )
-"""In the order of the paper's section 3."""
+"""The sequences in the order of the paper's section 3."""
 
 
 NAMES = tuple(entry.name for entry in SUITE)
 
 
 def find(name: str) -> UsmeSequence:
-    """The sequence of that name.
+    """Find a sequence by name.
 
     Raises:
         InputError: there is none.
@@ -196,13 +196,13 @@ def find(name: str) -> UsmeSequence:
 def render(
     entry: UsmeSequence, scene: Scene, image_size: str = "160x120", frames_scale: float = 1.0
 ) -> RenderedSequence:
-    """The frames of a sequence, rendered when they are asked for.
+    """Render a sequence, frame by frame on request.
 
-    ``scene`` is ``scenes.make(entry.scene, seed)``; its seed is that of the way, the noise and the
-    perturbations too.
+    ``scene`` is ``scenes.make(entry.scene, seed)``; its seed is also that of the path, the noise
+    and the perturbations.
 
     Raises:
-        InputError: an unknown size, or no free way.
+        InputError: an unknown size, or no free path.
     """
     from ms_slam_env.sequences import render_sequence
 
@@ -227,7 +227,7 @@ def describe(
     frames_scale: float = 1.0,
     with_truth: bool = False,
 ) -> dict[str, Any]:
-    """What makes a sequence, for its folder."""
+    """Describe how a sequence is made, for its folder."""
     return {
         "version": __version__,
         "suite": "usme",
@@ -250,7 +250,7 @@ def make_suite(
     frames_scale: float = 1.0,
     with_truth: bool = False,
 ) -> list[Path]:
-    """Write sequences into folders of ``out``; go on where an interrupted call stopped.
+    """Write sequences into folders of ``out``; resume an interrupted call.
 
     Raises:
         InputError: an unknown name or size, or a folder that holds something else.
@@ -260,7 +260,7 @@ def make_suite(
     for name in names:
         entry = find(name)
         if entry.scene not in made:
-            made = {entry.scene: scenes.make(entry.scene, seed)}  # one is large enough
+            made = {entry.scene: scenes.make(entry.scene, seed)}  # one at a time: it is large
         sequence = render(entry, made[entry.scene], image_size, frames_scale)
         about = describe(name, image_size, seed, frames_scale, with_truth)
         write_sequence(sequence, out / name, about, with_truth)
@@ -272,7 +272,7 @@ def made_with(folder: Path) -> dict[str, Any]:
     """The ``image_size``, ``seed`` and ``frames_scale`` that a sequence's folder was made with.
 
     Raises:
-        InputError: it holds none, or one of another suite or version.
+        InputError: the folder holds none, or one of another suite or version.
     """
     file = folder / DESCRIPTION
     if not file.is_file():

@@ -1,4 +1,4 @@
-"""A sequence as a folder in the TUM layout, which appears only when it is whole."""
+"""Writes a sequence to a folder in the TUM layout, which appears only when complete."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     from ms_slam_env.sequences.rendering import RenderedSequence
 
 DEPTH_SCALE = 5000.0
-"""Value of a depth image for one metre, as in the TUM RGB-D benchmark."""
+"""Depth image value per metre, as in the TUM RGB-D benchmark."""
 
 DESCRIPTION = "sequence.json"
-"""What made a sequence; in a folder that is being written it is called ``UNFINISHED``."""
+"""File that describes how a sequence was made; in an unfinished folder it is ``UNFINISHED``."""
 
 UNFINISHED = "incomplete.json"
 
 
 def working_folder(folder: Path) -> Path:
-    """Where a sequence grows until it is whole."""
+    """Folder in which a sequence is written until it is complete."""
     return folder.with_name(folder.name + ".partial")
 
 
@@ -46,18 +46,18 @@ def write_sequence(
 ) -> bool:
     """Write a rendered sequence in the TUM layout; show progress.
 
-    ``rgb/TIME.png``, ``depth/TIME.png`` (16 bits, 5000 a metre, 0 = no reading or beyond 13.1 m),
-    ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``, ``intrinsics.txt`` and ``sequence.json``; of
-    every moving object ``objects/NAME.txt``, its poses T_world_object at the times of the frames.
-    Everything grows in ``FOLDER.partial``, image by image, each appearing when it is whole, and
-    the folder gets its name at the end. A second call with the same description goes on where an
-    interrupted one stopped, and ends with the same files.
+    Files: ``rgb/TIME.png``, ``depth/TIME.png`` (16 bits, 5000 per metre, 0 = no reading or beyond
+    13.1 m), ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``, ``intrinsics.txt`` and
+    ``sequence.json``; for every moving object ``objects/NAME.txt``, its poses T_world_object at the
+    frames' times. Everything is written to ``FOLDER.partial``, each image atomically, and the
+    folder is renamed at the end. A second call with the same description resumes an interrupted
+    one, and produces the same files.
 
     Args:
-        sequence: what to write.
+        sequence: the sequence.
         folder: must not exist, or hold the same sequence.
-        description: what makes the sequence, for ``sequence.json``; two sequences with equal
-            descriptions are taken for the same.
+        description: how the sequence is made, for ``sequence.json``; sequences with equal
+            descriptions count as the same.
         with_truth: also write ``depth_true/TIME.png``, the noise-free depth from the true pose,
             ``labels/TIME.png``, the object there (16 bits, 0 = none), and ``objects.txt``.
 
@@ -76,8 +76,8 @@ def write_sequence(
 def _write_whole(
     sequence: RenderedSequence, target: Path, content: dict[str, Any], with_truth: bool
 ) -> bool:
-    """Write a sequence, or what is left of it; return whether anything was."""
-    if _is_there(target, content):  # by now
+    """Write a sequence or its missing rest; return whether anything was written."""
+    if _is_there(target, content):  # written by another process meanwhile
         return False
     partial = working_folder(target)
     _begin(partial, content)
@@ -104,11 +104,11 @@ def _write_whole(
 
 
 def write_frames(sequence: Sequence, folder: Path) -> None:
-    """Write what a camera gives of a sequence into a folder, in the TUM layout, and no true pose.
+    """Write only a sequence's images to a folder in the TUM layout, without true poses.
 
-    ``rgb/TIME.png``, ``depth/TIME.png``, ``rgb.txt``, ``depth.txt`` and ``intrinsics.txt``, as
-    `write_sequence`; TIME in seconds with six decimals. ``intrinsics.txt`` is one line of numbers,
-    ``fx fy cx cy width height depth_scale``.
+    Files: ``rgb/TIME.png``, ``depth/TIME.png``, ``rgb.txt``, ``depth.txt`` and ``intrinsics.txt``,
+    as in `write_sequence`; TIME in seconds with six decimals. ``intrinsics.txt`` is one line of
+    numbers, ``fx fy cx cy width height depth_scale``.
     """
     names = []
     for frame in sequence.frames:
@@ -137,7 +137,7 @@ def _is_there(target: Path, content: dict[str, Any]) -> bool:
 
 
 def _begin(partial: Path, content: dict[str, Any]) -> None:
-    """Make the working folder, or check that it is the beginning of the same sequence."""
+    """Make the working folder, or check that it belongs to the same sequence."""
     own_folder(partial)
     if any(partial.iterdir()):
         if (partial / DESCRIPTION).is_file():  # interrupted between the last two steps
@@ -158,7 +158,7 @@ def _read(path: Path) -> Any:
 def _write_frame(
     partial: Path, name: str, sequence: RenderedSequence, index: int, with_truth: bool
 ) -> None:
-    """Write what is missing of a frame."""
+    """Write the missing files of a frame."""
     rgb, depth = partial / f"rgb/{name}.png", partial / f"depth/{name}.png"
     if not (rgb.exists() and depth.exists()):
         frame = sequence.frames[index]
@@ -174,7 +174,7 @@ def _write_frame(
 
 
 def depth_values(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Values (H, W) of a 16-bit depth image; what is too far for them is no reading."""
+    """Values (H, W) of a 16-bit depth image; depth beyond its range becomes no reading."""
     values = np.rint(depth.astype(np.float64) * DEPTH_SCALE)
     return np.where(values <= np.iinfo(np.uint16).max, values, 0).astype(np.uint16)
 

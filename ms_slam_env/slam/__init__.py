@@ -1,4 +1,4 @@
-"""SLAM: backends by name, and what they have in common."""
+"""SLAM backends by name, and their common interface."""
 
 from ms_slam_env.slam.configuration import (
     SlamConfiguration,

@@ -1,4 +1,4 @@
-"""A SLAM configuration as a YAML file: backend, its parameters, and how frames are fed to it."""
+"""SLAM configurations as YAML files: backend, its parameters, and how frames are fed to it."""
 
 from __future__ import annotations
 
@@ -32,16 +32,18 @@ class SlamConfiguration(Checked):
 
     Attributes:
         slam: name of the backend.
-        slam_config: its parameters, such as the fields of ``SurfelConfig``.
-        image_size: the frames are reduced to this size, such as 160x120 or 160x120+crop; None
-            leaves it to whoever runs the configuration.
-        keep_every: of a recorded or rendered sequence, every n-th frame is processed. An
-            environment has no frames to leave out and takes no notice.
-        threads: cores that the backend may use; None for no limit. Where other work shares the
-            process, as in an environment, no notice is taken.
-        about: where the configuration comes from, such as the trial and what it measured.
-        compiler: options of the kernels' compiler (``CompilerOptions``); like ``threads``.
-        cpu_mhz: highest frequency of the processor; like ``threads``, and None for no limit.
+        slam_config: the backend's parameters, such as the fields of ``SurfelConfig``.
+        image_size: size that frames are reduced to, such as 160x120 or 160x120+crop; None leaves it
+            to whoever runs the configuration.
+        keep_every: process every n-th frame of a recorded or rendered sequence. Environments ignore
+            it.
+        threads: cores that the backend may use; None for no limit. Ignored where other work shares
+            the process, as in an environment.
+        about: origin of the configuration, such as the trial and its measurements.
+        compiler: options of the kernel compiler (``CompilerOptions``); ignored in the same cases as
+            ``threads``.
+        cpu_mhz: highest frequency of the processor; None for no limit; ignored in the same cases as
+            ``threads``.
 
     Raises:
         InputError: an unknown backend, parameter or size, or a value out of range.
@@ -64,18 +66,18 @@ class SlamConfiguration(Checked):
             parse_image_size(self.image_size)
 
     def compiler_options(self) -> CompilerOptions:
-        """Those of ``compiler`` as such."""
+        """``compiler`` as ``CompilerOptions``."""
         return from_dict(CompilerOptions, self.compiler, "compiler")
 
     @contextmanager
     def machine(self) -> Iterator[None]:
-        """Compiler, cores and clock as it says for the enclosed work, then as before."""
+        """Apply its compiler options, cores and clock to the enclosed code, then restore them."""
         compiler = compiled(self.compiler_options())
         with compiler, limited_threads(self.threads), limited_clock(self.cpu_mhz):
             yield
 
     def __str__(self) -> str:
-        """In a few words: image size, iterations and the like, share of the frames."""
+        """Describe it briefly: image size, parameters such as iterations, share of the frames."""
         parts = [self.image_size or "full size"]
         for key, value in self.slam_config.items():
             is_list = isinstance(value, (tuple, list))
@@ -92,11 +94,11 @@ def make(
 
     Args:
         name: one of ``BACKENDS``, an entry point (group ``ms_slam_env.slam``), ``module:Class``, a
-            class, or a configuration file (YAML) that names one with parameters;
-            the frames' size is that of ``intrinsics`` all the same.
-        intrinsics: of every frame.
-        params: of the backend, such as the fields of ``SurfelConfig``; ``device`` = "cpu" or
-            "cuda" where the backend has a choice. They take precedence over those of a file.
+            class, or a configuration file (YAML) that names one with parameters. The frame size
+            always comes from ``intrinsics``.
+        intrinsics: intrinsics of every frame.
+        params: parameters of the backend, such as the fields of ``SurfelConfig``; ``device`` =
+            "cpu" or "cuda" if the backend has a choice. They override those of a file.
 
     Raises:
         InputError: unknown backend, unknown parameter or value out of range, or a bad file.
@@ -113,18 +115,18 @@ def open_map(
     backend: str | type[SlamBackend] | None = None,
     **params: Any,
 ) -> SlamBackend:
-    """Make the backend that wrote a map, for the same camera, and let it go on in the map.
+    """Open a saved map: make the backend that wrote it, for the same camera, and load the map.
 
     Args:
-        path: of a file that ``SlamBackend.save`` wrote.
-        lost: whether the camera is somewhere else by now; see ``SlamBackend.load``.
-        backend: the backend, where it is not one of ``BACKENDS``: a file never says whose code
-            runs. Its parameters are then ``params`` alone, which must be those it had.
-        params: of the backend, before those that it had.
+        path: path of a file that ``SlamBackend.save`` wrote.
+        lost: whether the camera has moved since; see ``SlamBackend.load``.
+        backend: the backend, if it is not one of ``BACKENDS``: a file never says whose code runs.
+            Its parameters are then only ``params``, which must be those it had.
+        params: parameters of the backend; they override the saved ones.
 
     Raises:
-        InputError: as ``SlamBackend.load``; the map of another backend, or of one that must be
-            named; a parameter that is unknown, or with which the map does not fit.
+        InputError: as in ``SlamBackend.load``; the map comes from another backend, or from one that
+            must be named; a parameter is unknown or does not fit the map.
     """
     about = read_about(Path(path))
     intrinsics = _part(about, "intrinsics", path)
@@ -144,13 +146,13 @@ def configuration_of_map(
     """Backend, parameters and image size that wrote a map.
 
     Args:
-        path: of the file.
-        backend: as ``open_map`` takes it; it must be made with ``params``.
-        params: parameters that are given besides.
+        path: path of the file.
+        backend: backend, as in ``open_map``; it must be made with ``params``.
+        params: parameters given in addition.
 
     Raises:
-        InputError: no such file, no map, the map of another backend, or of one that must be named,
-            or needs parameters besides.
+        InputError: no such file, not a map, the map of another backend, of one that must be named,
+            or of one that needs more parameters.
     """
     about = read_about(Path(path))
     name, own = _maker(about, path, backend, params or {})
@@ -167,9 +169,9 @@ def configuration_of_map(
 def _maker(
     about: Mapping[str, Any], path: str | Path, backend: Any, given: Mapping[str, Any]
 ) -> tuple[Any, dict[str, Any]]:
-    """The backend that wrote a map, and its parameters if it is one of ours.
+    """The backend that wrote a map, and its parameters if it is built in.
 
-    Of a user's only the names of its parameters are taken from the file: they must be ``given``.
+    For a user's backend, the file gives only the names of the parameters: they must be ``given``.
     """
     cls, module = about.get("backend"), about.get("module")
     own = backend_name(cls, module)
@@ -202,7 +204,7 @@ def _part(about: Mapping[str, Any], key: str, path: str | Path) -> Mapping[str, 
 
 
 def is_file_name(name: object) -> bool:
-    """Whether ``name`` is meant as a configuration file: a path, or text that ends as YAML does."""
+    """Whether ``name`` denotes a configuration file: a path, or text with a YAML suffix."""
     return isinstance(name, Path) or (isinstance(name, str) and name.lower().endswith(SUFFIXES))
 
 
@@ -210,8 +212,8 @@ def read_configuration(path: str | Path) -> SlamConfiguration:
     """Read a configuration file.
 
     Raises:
-        InputError: no such file, no YAML, an unknown or repeated key, or a bad value; one line that
-            names the file and the key.
+        InputError: no such file, not YAML, an unknown or repeated key, or a bad value. The message
+            is one line that names the file and the key.
     """
     text = read_text(path, "configuration", _MAX_BYTES)
     try:
@@ -228,10 +230,10 @@ def read_configuration(path: str | Path) -> SlamConfiguration:
 
 
 def read_levels(path: str | Path, part: str) -> Mapping[str, Any]:
-    """What a file of levels, which an exploration writes, says of ``part`` of SLAM.
+    """Read the section ``part`` of a levels file, which a design-space exploration writes.
 
     Raises:
-        InputError: no such file, no YAML, or nothing said of ``part``.
+        InputError: no such file, not YAML, or no section ``part``.
     """
     try:
         content = load_yaml(read_text(path, "levels", _MAX_BYTES))
@@ -259,7 +261,7 @@ def write_configuration(path: str | Path, configuration: SlamConfiguration) -> N
 
 
 def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Options ``base`` with those of ``over`` in their place, at any depth."""
+    """Merge options: ``over`` takes precedence over ``base`` at every depth."""
     result = dict(base)
     for key, value in over.items():
         old = result.get(key)
@@ -270,7 +272,7 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """``value`` with mappings, lists, text and Python's own numbers only."""
+    """Convert ``value`` to mappings, lists, text and Python numbers only."""
     if isinstance(value, Mapping):
         return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):

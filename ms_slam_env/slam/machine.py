@@ -1,4 +1,4 @@
-"""How a SLAM is run besides its own parameters: compiler, cores and clock of the processor.
+"""Machine settings for running SLAM: kernel compiler options and processor clock.
 
 The compiler and hardware levels of the design space (Saeedi et al., ICRA 2017, section II-B).
 """
@@ -19,9 +19,9 @@ from ms_slam_env.errors import InputError
 _WARP_FLAGS = (
     "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 "
     "-mllvm=-slp-recursion-max-depth=4"
-)  # Warp 1.19's own; naming them makes what follows independent of the user's global setting
-# What Clang means by -ffast-math, as its front end spells it, less the assumption that no number is
-# infinite or none: kernels ask whether readings are.
+)  # Warp 1.19's own; repeated here so that the user's global setting does not matter
+# Clang's -ffast-math as its front end spells it, but without assuming finite numbers: kernels test
+# readings for infinity and NaN.
 _FAST_MATH = " -mreassociate -freciprocal-math -fno-signed-zeros -fapprox-func -ffp-contract=fast"
 _NO_VECTORS = " -fno-vectorize -fno-slp-vectorize"
 CPU_FREQUENCIES = Path("/sys/devices/system/cpu")
@@ -30,16 +30,16 @@ CPU_FREQUENCIES = Path("/sys/devices/system/cpu")
 
 @dataclass(frozen=True)
 class CompilerOptions(Checked):
-    """How Warp compiles the kernels of SLAM; by default as Warp itself would.
+    """How Warp compiles the SLAM kernels; the defaults are Warp's own.
 
     Attributes:
         optimization_level: 0 to 3; None for Warp's own, 2 on a CPU and 3 on a GPU.
-        fast_math: arithmetic may be reordered and approximated. Warp passes it on to a GPU's
-            compiler alone; that of the CPU gets Clang's flag of that name.
-        vectorise: several numbers at a time, on a CPU.
+        fast_math: allow reordered and approximate arithmetic. Warp passes its option only to the
+            GPU compiler; the CPU compiler gets Clang's flags for it.
+        vectorise: allow vector instructions on a CPU.
         grid_stride: kernels loop over more threads than the device runs at once.
-        fuse_fp: a product and a sum may be rounded once. On a CPU no bit of a run changed with it.
-        block_dim: threads of a block, on a GPU; a CPU runs one.
+        fuse_fp: allow fused multiply-add, which rounds once. On a CPU it changed no bit of a run.
+        block_dim: threads per block on a GPU; a CPU runs one.
     """
 
     optimization_level: int | None = bounded(None, 0, 3)
@@ -50,7 +50,7 @@ class CompilerOptions(Checked):
     block_dim: int = bounded(256, 32, 1024)
 
     def module_options(self) -> dict[str, Any]:
-        """What Warp calls it: options of a module."""
+        """These options as Warp's module options."""
         flags = _FAST_MATH * self.fast_math + _NO_VECTORS * (not self.vectorise)
         return {
             "optimization_level": self.optimization_level,
@@ -64,11 +64,11 @@ class CompilerOptions(Checked):
 
 @contextmanager
 def compiled(options: CompilerOptions) -> Iterator[None]:
-    """Compile the surfel SLAM's kernels with ``options`` where the enclosed work launches them.
+    """Compile the surfel SLAM's kernels with ``options`` when the enclosed code launches them.
 
-    Compiled kernels are kept under a hash that contains the options, so that those of others stay
-    what they are. It holds for the whole process; a SLAM that was made before keeps the kernels
-    that it has launched.
+    Compiled kernels are cached under a hash that includes the options, so kernels compiled with
+    other options are unaffected. The options apply to the whole process; a SLAM made earlier keeps
+    the kernels it has already launched.
     """
     if options == CompilerOptions():
         yield
@@ -95,10 +95,10 @@ def compiled(options: CompilerOptions) -> Iterator[None]:
 
 @contextmanager
 def limited_clock(mhz: int | None, root: Path = CPU_FREQUENCIES) -> Iterator[None]:
-    """Let no core run faster than ``mhz`` during the enclosed work; None leaves the clock alone.
+    """Limit every core to ``mhz`` during the enclosed code; None leaves the clock alone.
 
     Raises:
-        InputError: the machine does not let its clock be set.
+        InputError: the clock cannot be set on this machine.
     """
     if mhz is None:
         yield
@@ -118,7 +118,7 @@ def limited_clock(mhz: int | None, root: Path = CPU_FREQUENCIES) -> Iterator[Non
 
 
 def why_no_clock(root: Path = CPU_FREQUENCIES) -> str:
-    """Why the processor's clock cannot be set here; empty where it can."""
+    """Why the processor's clock cannot be set here; empty if it can."""
     files = sorted(root.glob("cpu[0-9]*/cpufreq/scaling_max_freq"))
     if not files:
         return f"{root} has no cpufreq: the machine keeps its clock to itself"
@@ -131,7 +131,7 @@ def why_no_clock(root: Path = CPU_FREQUENCIES) -> str:
 
 
 def clock_range_mhz(root: Path = CPU_FREQUENCIES) -> tuple[int, int]:
-    """Lowest and highest frequency of the first core."""
+    """Lowest and highest frequency of the first core, MHz."""
     low, high = (
         int((root / "cpu0" / "cpufreq" / f"cpuinfo_{end}_freq").read_text()) // 1000
         for end in ("min", "max")

@@ -1,6 +1,6 @@
-"""SLAM backends, by name; each is imported where it is made.
+"""SLAM backends by name; each is imported only when it is made.
 
-Loading kernels takes a while, and an extra may be missing.
+Loading kernels takes a while, and an optional dependency may be missing.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from ms_slam_env.slam.slam_backend import SlamBackend
 
 @dataclass(frozen=True)
 class BackendEntry:
-    """Where a backend is."""
+    """Where to import a backend from."""
 
     module: str  # its module below ``ms_slam_env.slam``
-    backend: str  # name of its class, made of intrinsics and configuration
-    config: str  # name of the dataclass of its parameters
-    has_devices: bool = False  # whether it takes a device as well
+    backend: str  # name of its class, constructed from intrinsics and configuration
+    config: str  # name of its parameter dataclass
+    has_devices: bool = False  # whether it also takes a device
 
     def load(self, name: str) -> Any:
-        """The class ``name`` of its module."""
+        """Import the class ``name`` from its module."""
         return getattr(import_module(f"ms_slam_env.slam.{self.module}"), name)
 
 
@@ -40,7 +40,7 @@ _OWN = {
 }
 
 BACKENDS: tuple[str, ...] = tuple(_OWN)
-"""Names of our backends."""
+"""Names of the built-in backends."""
 
 POINT = ExtensionPoint(
     "SLAM backend",
@@ -52,11 +52,11 @@ POINT = ExtensionPoint(
         "ms-slam compare --backends 'NAME=command:PROGRAM --in {sequence} --out {trajectory}'"
     },
 )
-"""Where backends are found; a user's class is made of intrinsics and its options as keywords."""
+"""Finds backends; a user's class is constructed with intrinsics and its options as keywords."""
 
 
 def make_backend(name: object, intrinsics: Intrinsics, params: Mapping[str, Any]) -> SlamBackend:
-    """The backend ``name`` for a camera; see ``ms_slam_env.slam.make``.
+    """Make the backend ``name`` for a camera; see ``ms_slam_env.slam.make``.
 
     Raises:
         InputError: unknown backend, unknown parameter or value out of range.
@@ -74,17 +74,17 @@ def make_backend(name: object, intrinsics: Intrinsics, params: Mapping[str, Any]
 
 
 def backend_name(cls_name: object, module: object = None) -> str | None:
-    """Name of our backend whose class has this name, in a ``module`` of ours; None if none has."""
+    """Name of the built-in backend with this class name and ``module``; None if there is none."""
     names = {entry.backend: name for name, entry in _OWN.items()}
     is_ours = module is None or str(module).startswith("ms_slam_env.")
     return names.get(cls_name) if is_ours and isinstance(cls_name, str) else None
 
 
 def check_parameters(name: object, params: object) -> Any:
-    """Refuse what ``make_backend`` would refuse, without making a backend.
+    """Check a backend's options without making it; refuses whatever ``make_backend`` would.
 
     Returns:
-        the backend's parameters as its dataclass; of a user's class as they are.
+        the parameters as the backend's dataclass; for a user's class, ``params`` as a dictionary.
 
     Raises:
         InputError: unknown backend, unknown parameter or value out of range.

@@ -22,17 +22,18 @@ from ms_slam_env.slam.shared.state_file import check_packable, read_state, write
 from ms_slam_env.slam.shared.submap_frames import Submaps, one_submap
 
 LARGEST_CUTOFF_M = 12.0
-"""Of depth, by any backend: as far as a sensor model reads (``RangeNoise``)."""
+"""Largest depth cutoff of any backend: the range of the sensor model (``RangeNoise``)."""
 
 
 @dataclass(frozen=True)
 class Loop:
-    """What a closed loop says: where the camera is beside a place that it had left.
+    """A closed loop: the camera's pose relative to a place that it has returned to.
 
     Attributes:
-        reference: number of an old frame of that place, as ``SlamBackend.frames_counted`` counts.
-        T_reference_camera: (4, 4) pose of the camera in that frame's.
-        bent: whether the map was bent; it is not where all but fits already.
+        reference: number of an old frame of that place, counted as in
+            ``SlamBackend.frames_counted``.
+        T_reference_camera: (4, 4) pose of the camera in the reference frame's camera frame.
+        bent: whether the map was deformed; False where it nearly fits already.
     """
 
     reference: int
@@ -42,37 +43,37 @@ class Loop:
 
 @dataclass(frozen=True)
 class TrackResult:
-    """What SLAM says after one frame.
+    """SLAM's result for one frame.
 
     Attributes:
         T_world_camera: (4, 4) estimated pose; the last good one while tracking is lost.
         tracking_ok: whether the pose is known: the frame was aligned with the map.
-        uncertain: whether that is doubtful: the pose is the best there is, its covariance is
-            larger, and nothing was fused into the map.
+        uncertain: whether the pose is doubtful: it is the best estimate available, its covariance
+            is larger, and nothing was fused into the map.
         relocalised: whether this frame ended a period of lost tracking.
-        inlier_fraction: share of the frame's valid pixels that the alignment explained.
+        inlier_fraction: share of the frame's valid pixels that the alignment explains.
         residual_m: RMS point-to-plane residual of the inliers, metres.
-        overlap: share of the frame's readings that land on the view that it was aligned with.
-        reason: why tracking failed, in words; empty when it did not.
-        loop_closed: whether this frame closed a loop: the map was bent, and the pose jumped by the
-            drift that was taken back.
-        loop: what that loop says, also of one that all but fitted and bent nothing; None: there was
-            none.
-        degenerate_directions: number of directions of the pose, of six, that the view does not
+        overlap: share of the frame's readings that land on the view it was aligned with.
+        reason: why tracking failed, in words; empty if it succeeded.
+        loop_closed: whether this frame closed a loop: the map was deformed, and the pose jumped by
+            the corrected drift.
+        loop: the loop that was found, even if it nearly fitted and the map was not deformed; None
+            if there was none.
+        degenerate_directions: how many of the pose's six degrees of freedom the view does not
             constrain, as in front of a blank wall; along them the pose is only predicted.
-        covariance: (6, 6) of the pose relative to the map, whose own drift is not part of it: of
-            the twist xi = (rho, phi) in metres and radians, in the camera's frame, with the true
-            pose T_world_camera exp(xi). None where no pose was estimated, or by a backend that
-            does not know it.
-        submap: number of the submap that the frame is part of, the oldest it is joined to; the pose
-            in one that is not joined to the first is as good as the guess at which it started, and
-            ``covariance`` says so.
+        covariance: (6, 6) covariance of the pose relative to the map, excluding the map's own
+            drift. It is that of the twist xi = (rho, phi) in metres and radians, in the camera's
+            frame, with the true pose T_world_camera exp(xi). None if no pose was estimated or the
+            backend does not compute it.
+        submap: number of the frame's submap, that is of the oldest submap it is joined to. The pose
+            in a submap not joined to the first is only as good as the guess it started from, and
+            ``covariance`` includes that error.
         submaps_joined: whether this frame joined two submaps: the newer was moved onto the older.
-            If that was the present one the pose jumped by what its start had been wrong.
-        moving: (h, w) bool, every n-th row and column of the mask of what moves in the frame, which
-            is neither tracked nor mapped; None by a backend that does not look for it.
-        processed: False where frame management dropped the frame: SLAM has not seen it, the pose
-            is predicted and ``tracking_ok`` is what it was.
+            If the newer is the current one, the pose jumped by the error of its start.
+        moving: (h, w) bool, every n-th row and column of the mask of moving objects, which are
+            neither tracked nor mapped; None if the backend does not detect them.
+        processed: False if frame selection dropped the frame: SLAM has not seen it, the pose is
+            predicted and ``tracking_ok`` keeps its last value.
     """
 
     T_world_camera: Float64
@@ -111,9 +112,9 @@ class Views:
     Attributes:
         intensity: (N, h, w) float32 in [0, 255]; 0 where the map is empty.
         depth: (N, h, w) float32 metres; 0 where the map is empty.
-        normals: (N, h, w, 3) float32 unit vectors in the camera frame, towards the camera;
-            0 where the map is empty.
-        intrinsics: of the predicted images.
+        normals: (N, h, w, 3) float32 unit vectors in the camera frame, facing the camera; 0 where
+            the map is empty.
+        intrinsics: intrinsics of the predicted images.
     """
 
     intensity: Float32
@@ -123,12 +124,12 @@ class Views:
 
 
 class SlamBackend(Stateful):
-    """Estimates the camera's pose from RGB-D frames and keeps a map that it can render.
+    """Estimates the camera's pose from RGB-D frames and builds a map that it can render.
 
     Attributes:
-        intrinsics: of every frame.
-        config: the parameters, a dataclass; None for a backend that has none.
-        options: those that a user's backend was made with by its name; a saved map names them.
+        intrinsics: intrinsics of every frame.
+        config: dataclass of the parameters; None for a backend without any.
+        options: options that a user's backend was made with by its name; a saved map names them.
     """
 
     intrinsics: Intrinsics
@@ -145,36 +146,36 @@ class SlamBackend(Stateful):
 
         Args:
             frame: the sensor's frame.
-            T_world_camera_guess: (4, 4) where the camera may be, such as an arm's forward
-                kinematics says. One more pose to start the alignment from, no constraint; the
+            T_world_camera_guess: (4, 4) where the camera may be, for example from an arm's forward
+                kinematics. It is one more initial pose for the alignment, not a constraint. The
                 first frame after ``reset`` is taken at the pose given there.
 
         Raises:
-            InputError: the frame's size is not that of the intrinsics, or the guess is no pose.
+            InputError: the frame's size differs from the intrinsics, or the guess is not a pose.
         """
 
     @abstractmethod
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
-        """Fuse ``frame`` into the map at a pose (4, 4) that is known; nothing is tracked.
+        """Fuse ``frame`` into the map at a known pose (4, 4), without tracking.
 
-        ``track`` may go on from there.
+        ``track`` may continue from there.
 
         Raises:
-            InputError: the frame's size is not that of the intrinsics, or the pose is none.
+            InputError: the frame's size differs from the intrinsics, or the pose is not one.
         """
 
     @abstractmethod
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
         """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size.
 
-        Of several submaps the present one, with all that is joined to it.
+        If there are several submaps: the current one and all that are joined to it.
         """
 
     @abstractmethod
     def surface_points(self) -> Float64:
         """Points (M, 3) of the estimated surface in the world frame, metres.
 
-        Those of all submaps; of unjoined ones where they lie by the best guess.
+        Includes all submaps; unjoined ones are placed by the best guess.
         """
 
     @abstractmethod
@@ -182,76 +183,76 @@ class SlamBackend(Stateful):
         """Colours (M, 3) RGB of ``surface_points``, in the same order."""
 
     def map_points(self) -> Float64:
-        """Every point (M, 3) of the map, metres: also those that later frames must confirm.
+        """All points (M, 3) of the map, metres, including those not yet confirmed by later frames.
 
-        A backend that confirms nothing has no others than ``surface_points``.
+        The same as ``surface_points`` for a backend without confirmation.
         """
         return self.surface_points()
 
     def map_attributes(self) -> dict[str, NDArray[Any]]:
-        """What is known of each of ``surface_points``, by name, in the same order.
+        """Attributes of ``surface_points`` by name, in the same order.
 
-        ``color`` (M, 3) uint8 RGB; where the backend has them ``normal`` (M, 3), ``radius`` (M,)
-        metres, ``confidence`` (M,), and ``submap`` (M,) int32 where there are several.
+        ``color`` (M, 3) uint8 RGB; if the backend has them, ``normal`` (M, 3), ``radius`` (M,)
+        metres and ``confidence`` (M,); ``submap`` (M,) int32 if there are several submaps.
         """
         return {"color": self.surface_colors()}
 
     def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
-        """Frames (N,), counted since ``reset``, and their poses (N, 4, 4) as the map has them now.
+        """Frame numbers (N,), counted from ``reset``, and their poses (N, 4, 4) in the current map.
 
-        Closed loops and joined submaps have moved them since ``track`` returned them. Empty where
-        there are neither.
+        Closed loops and joined submaps have moved them since ``track`` returned them. Empty if
+        there were neither.
         """
         return np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4))
 
     def submaps(self) -> Submaps:
-        """The submaps, as they hang together now; one where a backend starts no others."""
+        """The submaps and how they are joined now; one if the backend never starts others."""
         return one_submap()
 
     @property
     def needs_color(self) -> bool:
-        """Whether depth alone is not enough to track at all."""
+        """Whether tracking is impossible from depth alone."""
         return False
 
     @property
     def frames_counted(self) -> int:
-        """Number of the next frame as corrected poses, submaps and closed loops count them.
+        """Number of the next frame, as counted in corrected poses, submaps and closed loops.
 
-        0 by a backend that has none of them.
+        0 for a backend that has none of them.
         """
         return 0
 
     @property
     def closes_loops(self) -> bool:
-        """Whether it says so where it comes back to a place (``TrackResult.loop``)."""
+        """Whether it reports returning to a known place (``TrackResult.loop``)."""
         return False
 
     def mark_lost(self) -> None:
-        """The camera may be anywhere in the map: seek the next frame as one after lost tracking.
+        """Treat tracking as lost: search the whole map for the next frame.
 
-        A backend that has no other way than that leaves this as it is.
+        Need not be overridden by a backend that always searches this way.
         """
 
     def save(self, path: str | Path) -> None:
-        """Write map and pose to a file, whole or not at all; `load` reads it.
+        """Write map and pose to a file atomically; `load` reads it.
 
         Raises:
-            InputError: the state or the configuration holds what such a file cannot.
-            OSError: nothing can be written there.
+            InputError: the state or the configuration contains something that a file cannot hold.
+            OSError: the file cannot be written.
         """
         write_state(Path(path), _origin(self), _state_of(self))
 
     def load(self, path: str | Path, lost: bool = True) -> None:
-        """Take the map from a file that `save` of such a backend wrote, and go on mapping in it.
+        """Load a map that `save` of the same kind of backend wrote, and continue mapping in it.
 
         Args:
-            path: of the file.
-            lost: whether the camera is somewhere else by now, so that the next frame is sought in
-                the map; False goes on bit-exactly from where the camera was when it was saved.
+            path: path of the file.
+            lost: whether the camera has moved since, so that the next frame is relocalised in the
+                map; False continues bit-exactly from the saved camera pose.
 
         Raises:
-            InputError: no such file, damaged, of another version, backend or camera, or of a
-                configuration that keeps other things; the backend is as it was.
+            InputError: the file is missing or damaged, comes from another version, backend or
+                camera, or from a configuration that stores other things. The backend is unchanged.
         """
         about, state = read_state(Path(path))
         _check_origin(self, about, path)
@@ -260,7 +261,7 @@ class SlamBackend(Stateful):
             self.reset()
             check_like(state, self.state_like(), "map")
             self.set_state(state)
-        except Exception as error:  # whatever a part makes of what only looks like its state
+        except Exception as error:  # a part may fail on a state that only looks valid
             self.set_state(own)
             reason = str(error) if isinstance(error, InputError) else repr(error)
             raise InputError(f"{path} does not fit this backend: {reason}") from None
@@ -272,13 +273,13 @@ def check_saves(backend: SlamBackend) -> None:
     """Refuse a backend whose map cannot be saved, before any work is done.
 
     Raises:
-        InputError: naming the part of its state or configuration that a file cannot hold.
+        InputError: the message names the part of the state or configuration that does not fit.
     """
     check_packable(_origin(backend), _state_of(backend))
 
 
 def _origin(backend: SlamBackend) -> dict[str, Any]:
-    """What a file says of the backend that wrote it."""
+    """What a file says about the backend that wrote it."""
     config = backend.config
     if config is not None and (not is_dataclass(config) or isinstance(config, type)):
         raise InputError(
@@ -331,14 +332,14 @@ def _short(number: Any) -> str:
 
 
 def _camera(backend: SlamBackend) -> dict[str, Any]:
-    """Intrinsics of the camera; it has no lens."""
+    """Intrinsics of the camera without the lens distortion."""
     numbers = asdict(backend.intrinsics)
     del numbers["distortion"]
     return numbers
 
 
 def check_views(poses: ArrayLike, scale: float) -> Float64:
-    """``poses`` as an array (N, 4, 4); refuse another shape, and a scale outside (0, 1]."""
+    """Return ``poses`` as an array (N, 4, 4); refuse other shapes and a scale outside (0, 1]."""
     stack = as_numbers(poses, "poses")
     if stack.ndim != 3 or stack.shape[1:] != (4, 4):
         raise InputError(f"poses must have shape (N, 4, 4), got {stack.shape}")
@@ -370,5 +371,5 @@ class BorrowedMap(SlamBackend):
         return self._mapper.surface_colors()
 
     def map_attributes(self) -> dict[str, NDArray[Any]]:
-        """What is known of each of ``surface_points``."""
+        """Attributes of ``surface_points``."""
         return self._mapper.map_attributes()

@@ -1,7 +1,7 @@
 """Design-space exploration: parameters, studies on disk, workers and Pareto fronts.
 
-Saeedi et al., ICRA 2017, section IV. :func:`explore` takes what is evaluated as a callable;
-:func:`run_exploration` explores SLAM configurations over sequences and writes what came of it.
+Saeedi et al., ICRA 2017, section IV. :func:`explore` takes the evaluation as a callable;
+:func:`run_exploration` explores SLAM configurations over sequences and writes the results.
 """
 
 from typing import TYPE_CHECKING

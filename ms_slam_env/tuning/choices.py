@@ -1,4 +1,4 @@
-"""Which trials of a study to use: by purpose, at a divergence, as levels of adaptation."""
+"""Choose trials of a study by purpose, for a divergence, or as levels of adaptation."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from ms_slam_env.tuning.front import Point
 from ms_slam_env.tuning.objectives import METRICS
 
 COST = "ext_ms"
-"""What levels and the answer for a divergence cost: the time of a processed frame."""
+"""Cost of a level, or of the configuration for a divergence: the time of a processed frame."""
 CHANGE = "largest_change"
-"""What a level is measured at, as adaptation and frame management measure it."""
+"""Divergence that a level was measured at, as measured by adaptation and frame selection."""
 
 
 def choose(points: Sequence[Point], objectives: Sequence[str]) -> dict[str, Point]:
-    """Points of the front by purpose, of the first two objectives (error, cost).
+    """Points of the front by purpose, for the first two objectives (error, cost).
 
-    ``fastest``: the least cost whose error is not above the default's; ``most_accurate``: the least
-    error whose cost is not above the default's; ``knee``: farthest below the line between the two
-    ends of the front, on logarithmic axes. Without a default that finished well, only the knee.
+    ``fastest``: lowest cost with an error of at most the default's; ``most_accurate``: lowest error
+    with a cost of at most the default's; ``knee``: farthest below the line between the two ends of
+    the front, on logarithmic axes. If the default failed, only the knee.
     """
     front = sorted((p for p in points if p.on_front), key=lambda point: point.values)
     if not front:
@@ -49,8 +49,7 @@ def choose(points: Sequence[Point], objectives: Sequence[str]) -> dict[str, Poin
 def knee(values: ArrayLike) -> int:
     """Index of the point of a front (n, 2) that lies farthest below the line between its ends.
 
-    On logarithmic axes, each scaled to the front's extent: "farthest" then means the same whatever
-    the units are.
+    Axes are logarithmic and scaled to the front's extent, so that units do not matter.
     """
     logs = np.log(np.maximum(np.asarray(values, dtype=np.float64), 1e-12))
     extent = np.ptp(logs, axis=0)
@@ -62,11 +61,11 @@ def knee(values: ArrayLike) -> int:
 
 @dataclass(frozen=True)
 class Limit:
-    """Which trials are good enough: their error is at most ``tolerance`` times the default's.
+    """Largest acceptable error of a trial: ``tolerance`` times the default's.
 
     Attributes:
-        objective: the error, name of a metric.
-        value: that it may have; infinite without a default that finished well.
+        objective: name of the error metric.
+        value: largest acceptable value; infinite if the default failed.
     """
 
     objective: str
@@ -80,13 +79,13 @@ class Limit:
         return cls(objectives[0], value)
 
     def holds(self, point: Point) -> bool:
-        """Whether ``point`` is feasible, has its time measured, and is good enough."""
+        """Whether ``point`` is feasible, has a measured time, and is good enough."""
         error = error_of(point, self.objective)
         return point.feasible and _has(point, COST) and error <= self.value
 
 
 def error_of(point: Point, objective: str) -> float:
-    """What samplers are told of the error, though beyond the reference; infinite if unknown."""
+    """Error as passed to samplers, but not capped at the reference; infinite if unknown."""
     value = point.measured.get(objective)
     return math.inf if value is None else METRICS[objective].told(value)
 
@@ -96,13 +95,14 @@ def _has(point: Point, *names: str) -> bool:
 
 
 def for_divergence(points: Sequence[Point], M_I: float, M_D: float, limit: Limit) -> Point:
-    """The trial to use where divergences between processed frames reach (M_I, M_D), nats.
+    """The trial to use for divergences of up to (M_I, M_D), nats, between processed frames.
 
-    Of the feasible trials that were measured at divergences as large: the one whose processed frame
-    takes the least time within ``limit``, or else the one of the least error.
+    Considers the feasible trials that were measured at such divergences or larger ones. Returns the
+    one within ``limit`` whose processed frame takes the least time or, if none is within, the one
+    with the lowest error.
 
     Raises:
-        InputError: no trial was measured at divergences as large.
+        InputError: no trial was measured at such divergences.
     """
     known = [p for p in points if p.feasible and _has(p, COST, "M_I", "M_D")]
     hard = [p for p in known if p.measured["M_I"] >= M_I and p.measured["M_D"] >= M_D]
@@ -119,10 +119,10 @@ def for_divergence(points: Sequence[Point], M_I: float, M_D: float, limit: Limit
 
 
 def levels_of(points: Sequence[Point], limit: Limit) -> list[Point]:
-    """From fast to robust: trials within ``limit`` that none beats in both time and divergence.
+    """Trials within ``limit`` that none beats in both time and divergence, from fast to robust.
 
-    Run-time adaptation switches among them (section V-B of the paper): each is the fastest for all
-    divergences up to that which it was measured at.
+    Run-time adaptation switches among them (section V-B of the paper): each is the fastest for
+    divergences up to the one it was measured at.
     """
     good = [p for p in points if limit.holds(p) and _has(p, CHANGE)]
     levels: list[Point] = []
@@ -135,17 +135,17 @@ def levels_of(points: Sequence[Point], limit: Limit) -> list[Point]:
 def as_options(
     levels: Sequence[Point], made: Sequence[SlamConfiguration], points: Sequence[Point]
 ) -> dict[str, Any]:
-    """Options of run-time adaptation and frame management from a study's levels.
+    """Options of run-time adaptation and frame selection from a study's levels.
 
-    A level is taken up where the change between frames exceeds what the one before was measured at;
-    every frame is processed then. A filter may drop frames instead until the change is what the
-    last level was measured at, less what one more frame may add: the largest change between
-    consecutive frames of the study.
+    With adaptation, every frame is processed, and a level is activated when the change between
+    frames exceeds the one that the previous level was measured at. A filter instead drops frames
+    until the change reaches the one that the last level was measured at, minus the change that one
+    more frame may add: the largest between consecutive frames of the study.
 
     Args:
-        levels: of ``levels_of``.
+        levels: result of ``levels_of``.
         made: their configurations.
-        points: of the whole study.
+        points: all points of the study.
     """
     changes = [point.measured[CHANGE] for point in points if _has(point, CHANGE)]
     found: dict[str, Any] = {}

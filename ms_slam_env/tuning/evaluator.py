@@ -1,4 +1,4 @@
-"""What an exploration measures of a SLAM configuration: a run over each of several sequences."""
+"""Measure a SLAM configuration for an exploration by running it over several sequences."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ from ms_slam_env.slam.frame_selection.filters import Change
 from ms_slam_env.tuning.objectives import FAILURE
 
 CLOCKS = {"processor": "cpu_ms_median", "wall": "ext_ms_median"}
-"""What execution time is measured by, and the meter's name of it."""
+"""Clock of the execution time to the meter's key."""
 
 Row = dict[str, Any]
 
-_WARM_UP = 5  # frames left out of the timing: buffers grow, kernels are loaded
+_WARM_UP = 5  # frames left out of the timing, while buffers grow and kernels load
 _WARM_UP_FRAMES = 15
-_LEAST_ERROR_M = 1e-3  # in ratios; below, which of two errors is the larger is chance
+_LEAST_ERROR_M = 1e-3  # in ratios; below it, differences between errors are chance
 
 
 @dataclass(frozen=True)
 class SlamEvaluator(Checked):
-    """Runs configurations over sequences, which stay in memory; it can be sent to other processes.
+    """Runs configurations over sequences kept in memory; can be sent to other processes.
 
     Attributes:
         sequences: folders, or ``scene:seed[:word[+word ...]]``.
-        frames: of a rendered sequence.
-        speed_m_s: mean speed of the camera of a rendered sequence, where it does not turn.
-        turn_deg_s: mean speed of rotation, where it turns.
-        image_size: where a configuration does not say.
-        max_lost: share of the frames that tracking may lose; beyond, the run has failed.
-        clock: of the execution time: ``processor`` counts the time of all threads and not that of
-            other programs; ``wall`` is what a GPU needs.
-        map_error: whether maps are compared with the true surface, which takes a while.
-        baseline: a configuration whose error on each sequence is the unit of ``ate_worst_ratio``.
+        frames: number of frames of a rendered sequence.
+        speed_m_s: mean speed of the camera in a rendered sequence, while it does not turn.
+        turn_deg_s: mean angular speed while it turns.
+        image_size: image size for configurations that do not set one.
+        max_lost: share of the frames that tracking may lose before the run counts as failed.
+        clock: clock of the execution time: ``processor`` counts all threads but no other programs;
+            ``wall`` is the right choice for a GPU.
+        map_error: whether to compare maps with the true surface, which takes longer.
+        baseline: configuration whose error on each sequence is the unit of ``ate_worst_ratio``.
 
     Raises:
         InputError: an unknown name, or a value out of range.
@@ -68,7 +68,7 @@ class SlamEvaluator(Checked):
     baseline: SlamConfiguration | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what no run could use."""
+        """Refuse settings that no run could use."""
         super().__post_init__()
         if not self.sequences:
             raise InputError("no sequence to explore on")
@@ -82,7 +82,7 @@ class SlamEvaluator(Checked):
         return summarise(rows, [] if self.baseline is None else _baseline_rows(self))
 
     def context(self) -> Row:
-        """What decides the figures, to be kept with a study."""
+        """The settings that determine the results, to be stored with a study."""
         return asdict(self)
 
     def measure(self, configuration: SlamConfiguration, text: str) -> Row:
@@ -90,14 +90,14 @@ class SlamEvaluator(Checked):
 
         Returns:
             ``ate_m`` (RMSE, SE(3)-aligned), ``ate_tracked_m`` and ``tracked_share`` of the tracked
-            frames, ``ate_max_m``, ``ext_ms`` (median time of a processed
-            frame), ``load_ms`` (mean time by all frames, those left out included), ``mem_mb`` (peak
-            of the SLAM's own), ``energy_j`` and ``energy_model_j`` (a processed frame; the
-            latter where the former cannot be had, see `CostMeter`), ``map_error_mm``, ``lost``
-            (share of the processed frames), ``M_I``, ``M_D`` and ``largest_change`` (largest
-            divergences between processed neighbours, nats, the last as adaptation and frame
-            management measure it), ``frames``; None or missing where it cannot be had.
-            ``failure`` in words if tracking was lost too often, or SLAM broke down.
+            frames, ``ate_max_m``, ``ext_ms`` (median time of a processed frame), ``load_ms`` (time
+            per frame, counting dropped frames too), ``mem_mb`` (peak memory of SLAM), ``energy_j``
+            and ``energy_model_j`` (per processed frame; the latter if the former cannot be
+            measured, see `CostMeter`), ``map_error_mm``, ``lost`` (share of the processed frames),
+            ``M_I``, ``M_D`` and ``largest_change`` (largest divergences between neighbouring
+            processed frames, nats, the last as measured by adaptation and frame selection),
+            ``frames``; None or missing if not available. ``failure`` is a text if tracking was
+            lost too often or SLAM crashed.
 
         Raises:
             InputError: a sequence that cannot be read, or parameters that the backend refuses.
@@ -150,10 +150,10 @@ class SlamEvaluator(Checked):
 
 
 def summarise(rows: Sequence[Row], baseline: Sequence[Row] = ()) -> Row:
-    """One row for all sequences: means, but the largest of maxima and memory; any failure.
+    """One row for all sequences: means, the largest of maxima and memory, and any failure.
 
-    ``ate_worst_m`` is the largest error of a sequence, ``ate_worst_ratio`` the largest that a
-    sequence has in units of its ``baseline``.
+    ``ate_worst_m`` is the largest error of a sequence, ``ate_worst_ratio`` the largest ratio of a
+    sequence's error to its ``baseline``.
     """
     largest = ("ate_max_m", "mem_mb", "lost", "M_I", "M_D", "largest_change")
     errors = ("ate_m", "ate_tracked_m", "tracked_share", "map_error_mm")
@@ -175,9 +175,9 @@ def summarise(rows: Sequence[Row], baseline: Sequence[Row] = ()) -> Row:
 
 
 def worst_ratio(rows: Sequence[Row], baseline: Sequence[Row]) -> float:
-    """Largest error of a sequence in units of the baseline's on the same; NaN without any.
+    """Largest ratio of a sequence's error to the baseline's on it; NaN without sequences.
 
-    Errors below a millimetre count as one, or a sequence of half a millimetre would rule.
+    Errors below 1 mm count as 1 mm, so that a sequence with a tiny error does not dominate.
     """
     pairs = [(a.get("ate_m"), b.get("ate_m")) for a, b in zip(rows, baseline, strict=True)]
     least = _LEAST_ERROR_M
@@ -189,7 +189,7 @@ _BASELINES: dict[str, list[Row]] = {}
 
 
 def _baseline_rows(evaluator: SlamEvaluator) -> list[Row]:
-    """What ``evaluator``'s baseline measures on its sequences, once in a process."""
+    """Results of ``evaluator``'s baseline on its sequences, computed once per process."""
     key = spec_key(evaluator)
     if key not in _BASELINES:
         assert evaluator.baseline is not None
@@ -204,7 +204,7 @@ def _load(text: str, size: str, path: HandheldPath) -> SequenceWithSurface:
 
 @lru_cache(maxsize=1024)
 def _divergences(text: str, size: str, path: HandheldPath, every: int) -> dict[str, float]:
-    """Largest divergences between processed neighbours: equations (11) and (12), and their sum."""
+    """Largest divergences between neighbouring processed frames: equations (11), (12), and sum."""
     given = _load(text, size, path)
     frames = given.frames[::every]
     if len(frames) < 2:
@@ -224,7 +224,7 @@ _WARM: set[tuple[str, str, str]] = set()
 
 
 def _warm_up(backend: str, size: str, device: str, given: SequenceWithSurface) -> None:
-    """Run the backend once in this process before any run is timed: kernels are loaded."""
+    """Run the backend once in this process before any timed run, to load kernels."""
     if (backend, size, device) not in _WARM:
         _WARM.add((backend, size, device))
         system = slam.make(

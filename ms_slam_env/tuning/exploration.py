@@ -1,4 +1,4 @@
-"""An exploration from its settings to its results on disk."""
+"""Run an exploration, from its settings to its results on disk."""
 
 from __future__ import annotations
 
@@ -29,19 +29,20 @@ FOR_DIVERGENCE = "for-divergence"
 
 @dataclass(frozen=True)
 class Exploration(Checked):
-    """What is explored, on what, and how.
+    """Parameters, evaluation and settings of an exploration.
 
     Attributes:
         evaluator: measures a configuration.
         settings: objectives, constraints and sampler.
         parameters: ``NAME``, ``NAME=low:high[:log]``, ``NAME=a,b,c``, or a group of them.
-        base: configuration that the exploration starts from, its first trial.
-        held_out: sequences that the front and the chosen configurations are judged on.
-        for_divergence: (M_I, M_D) to name a configuration for besides; None for none.
-        tolerance: times the default's error that this one and levels of adaptation may have.
+        base: configuration of the first trial, from which the exploration starts.
+        held_out: sequences for testing the front and the chosen configurations.
+        for_divergence: (M_I, M_D) for which to choose one more configuration; None for none.
+        tolerance: largest error of that configuration and of levels of adaptation, as a multiple
+            of the default's.
 
     Raises:
-        InputError: an unknown name, a value out of range, a sequence that cannot be had, or an
+        InputError: an unknown name, a value out of range, a sequence that cannot be opened, or an
             objective that this machine or evaluation cannot measure.
     """
 
@@ -54,7 +55,7 @@ class Exploration(Checked):
     tolerance: float = bounded(1.2, 1.0, 1000.0)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be measured before a study is begun that would keep it."""
+        """Refuse settings that cannot be measured, before a study stores them."""
         super().__post_init__()
         for text in (*self.evaluator.sequences, *self.held_out):
             check_sequence(text)
@@ -85,17 +86,16 @@ def run_exploration(
     workers: int = 1,
     ray_address: str | None = None,
 ) -> Results:
-    """Explore until ``trials`` trials have finished, and write what came of it to ``out``.
+    """Explore until ``trials`` trials have finished, and write the results to ``out``.
 
-    ``study.db`` (Optuna's, to go on from), ``explore.json``, ``table.md``, ``pareto.png`` and
-    other figures, the chosen configurations as YAML, and in ``levels.yaml`` what run-time
-    adaptation and frame management take from the study (``choices.as_options``).
+    Files: ``study.db`` (Optuna's, to resume from), ``explore.json``, ``table.md``, ``pareto.png``
+    and other figures, the chosen configurations as YAML, and ``levels.yaml`` with options of
+    run-time adaptation and frame selection (``choices.as_options``).
 
     Raises:
         InputError: bad input, ``out`` holds another exploration, another process works in it, or,
-            when all is written, no trial was measured at the divergence to name a configuration
-            for.
-        RuntimeError: worker processes die again and again.
+            after everything is written, no trial was measured at the requested divergence.
+        RuntimeError: worker processes die repeatedly.
     """
     space = make_space(exploration.parameters, exploration.base)
     with alone_in(out):
@@ -111,7 +111,7 @@ def _explored(
     workers: int,
     ray_address: str | None,
 ) -> StudyStorage:
-    """The study with so many finished trials; show progress."""
+    """Continue the study until ``trials`` trials have finished, and show progress."""
     with Bar(total=trials, desc=exploration.settings.sampler, unit="trial") as bar:
         return explore(
             out,
@@ -130,7 +130,7 @@ def _show(bar: Bar, finished: int) -> None:
 
 
 def write_exploration(exploration: Exploration, storage: StudyStorage, out: Path) -> Results:
-    """Write everything but the study."""
+    """Write all files except the study."""
     objectives = exploration.settings.objectives
     points = points_of(storage)
     reference = storage.reference() or {}
@@ -140,7 +140,7 @@ def write_exploration(exploration: Exploration, storage: StudyStorage, out: Path
     levels = levels_of(points, limit)
     size = exploration.evaluator.image_size
     made = {name: _configuration(storage, point, name, size) for name, point in chosen.items()}
-    # A level is what its parameters can do at a divergence between frames that are all processed.
+    # A level describes its parameters at a divergence between frames that are all processed.
     made_levels = [
         replace(_configuration(storage, point, "level", size), keep_every=1) for point in levels
     ]
@@ -209,13 +209,13 @@ def write_exploration(exploration: Exploration, storage: StudyStorage, out: Path
 def _answer(
     exploration: Exploration, points: list[Point], limit: Limit
 ) -> Point | InputError | None:
-    """The configuration for the divergence asked for, or why there is none."""
+    """The configuration for the requested divergence, or the error that says why there is none."""
     if exploration.for_divergence is None:
         return None
     try:
         return for_divergence(points, *exploration.for_divergence, limit)
     except InputError as error:
-        return error  # it is raised when what was measured is on disk
+        return error  # raised once the measurements are on disk
 
 
 def _compared(
@@ -225,9 +225,9 @@ def _compared(
     chosen: dict[str, Point],
     out: Path,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """The default, the chosen and the rest of the front on held-out sequences.
+    """Compare the default, the chosen configurations and the front on held-out sequences.
 
-    Then default and chosen, measured again on the explored ones.
+    Also measures the default and the chosen ones again on the explored sequences.
     """
     known = {point.number for point in chosen.values()}
     others = {f"trial {p.number}": p for p in points if p.on_front and p.number not in known}
@@ -246,7 +246,7 @@ def _compared(
 def _configuration(
     storage: StudyStorage, point: Point, purpose: str, image_size: str
 ) -> SlamConfiguration:
-    """The configuration of ``point`` with where it comes from and the image size it ran at."""
+    """The configuration of ``point``, with its origin and the image size it ran at."""
     made = storage.space.configuration(point.params)
     about = {
         "purpose": purpose,

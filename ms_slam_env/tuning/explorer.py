@@ -1,4 +1,4 @@
-"""Explore until enough trials have finished: here, in processes, or on Ray."""
+"""Explore until enough trials have finished: in this process, in workers, or on Ray."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int], None]
 
-_MOST_DEATHS = 5  # of workers without a trial that finished in between
+_MOST_DEATHS = 5  # of workers without a finished trial in between
 
 
 def explore(
@@ -32,26 +32,26 @@ def explore(
     ray_address: str | None = None,
     progress: Progress | None = None,
 ) -> StudyStorage:
-    """Go on with the study in ``folder``, or begin it, until ``budget`` trials have finished.
+    """Start or resume the study in ``folder``, until ``budget`` trials have finished.
 
-    It may be killed at any moment and called again: what had finished is kept, what was running
-    is marked as failed and done again. Calls in several processes share the work
-    (``ms-slam explore`` has its folder to itself, and processes by ``--workers``).
+    The call may be killed at any time and repeated: finished trials are kept, running ones are
+    marked as failed and repeated. Several processes may call it and share the work. (``ms-slam
+    explore`` locks its folder, and starts processes with ``--workers``.)
 
     Args:
-        folder: of the study.
+        folder: folder of the study.
         space: the parameters.
-        settings: of the exploration.
+        settings: settings of the exploration.
         evaluate: measures a configuration.
-        budget: finished trials, those of earlier calls included.
-        workers: processes; with Ray, evaluations at the same time.
-        ray_address: of a Ray cluster; ``local`` for one on this machine that lives as long as the
-            call; None for no Ray.
-        progress: called now and then with the number of finished trials.
+        budget: number of finished trials, including those of earlier calls.
+        workers: number of processes; with Ray, of parallel evaluations.
+        ray_address: address of a Ray cluster; ``local`` starts one on this machine for the
+            duration of the call; None for no Ray.
+        progress: called from time to time with the number of finished trials.
 
     Raises:
         InputError: bad input, or a folder with another study.
-        RuntimeError: worker processes die again and again, or an evaluation raised something else.
+        RuntimeError: worker processes die repeatedly, or an evaluation raised another exception.
     """
     if isinstance(budget, bool) or budget < 1 or workers < 1:
         name, value = ("trials", budget) if budget < 1 else ("workers", workers)
@@ -68,7 +68,7 @@ def explore(
 
 
 def _explore_here(storage: StudyStorage, evaluate: Evaluate, budget: int, report: Progress) -> None:
-    """Do trials, one after the other, in this process."""
+    """Run trials one after the other in this process."""
     while _goes_on(storage, budget, report):
         trial = storage.ask(budget)
         if trial is None:
@@ -76,15 +76,15 @@ def _explore_here(storage: StudyStorage, evaluate: Evaluate, budget: int, report
             continue
         try:
             storage.tell(trial, evaluate(storage.configuration(trial)))
-        except BaseException as error:  # also an interrupt between evaluating and telling
+        except BaseException as error:  # including an interrupt before the result is stored
             storage.give_up(trial, recorded(error))
             raise
 
 
 def _explore_with(pool: Pool, storage: StudyStorage, budget: int, report: Progress) -> None:
-    """Do trials in workers; the study's file stays with this process.
+    """Run trials in workers; only this process accesses the study's file.
 
-    The trial of a worker that dies, as one killed for want of memory, is redone.
+    If a worker dies, for example for lack of memory, its trial is repeated.
     """
     running: dict[int, Trial] = {}
     deaths = 0
@@ -112,7 +112,7 @@ def _explore_with(pool: Pool, storage: StudyStorage, budget: int, report: Progre
 
 
 def _complaint(outcome: Outcome) -> Exception:
-    """What a worker raised, or that workers die."""
+    """The exception that a worker raised, or one that says that workers die."""
     if outcome.is_bad_input:
         return InputError(outcome.message)
     if outcome.died:
@@ -128,5 +128,5 @@ def _goes_on(storage: StudyStorage, budget: int, report: Progress) -> bool:
 
 
 def _wait_for_others() -> None:
-    """Let other processes finish the last trials, or die."""
+    """Wait until other processes have finished the last trials or died."""
     time.sleep(0.05)

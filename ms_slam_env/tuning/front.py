@@ -1,4 +1,4 @@
-"""Pareto fronts of finished trials: which trials, and how much they dominate."""
+"""Pareto fronts of finished trials, and the volume they dominate."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class Point:
     """A finished trial.
 
     Attributes:
-        number: of the trial.
+        number: number of the trial.
         params: values of the parameters.
         measured: everything that the evaluation returned.
-        values: of the objectives, as the sampler was told.
-        feasible: it did not fail and kept every constraint.
-        on_front: no feasible trial is as good in every objective and better in one, and every
-            objective is better than the reference.
-        is_default: it is the configuration that the exploration started from.
+        values: objective values as passed to the sampler.
+        feasible: whether it did not fail and met every constraint.
+        on_front: whether every objective is better than the reference, and no feasible trial is
+            at least as good in every objective and better in one.
+        is_default: whether it is the configuration that the exploration started from.
     """
 
     number: int
@@ -65,7 +65,7 @@ def points_of(storage: StudyStorage) -> list[Point]:
 
 
 def front_of(points: Sequence[Point], metrics: Sequence[str]) -> list[Point]:
-    """Those of ``points`` that none beats in ``metrics``, in the order of the last of them."""
+    """Those of ``points`` that none beats in ``metrics``, sorted by the last metric."""
     known = [p for p in points if all(p.measured.get(name) is not None for name in metrics)]
     told = [[METRICS[name].told(p.measured[name]) for name in metrics] for p in known]
     unbeaten = on_front(np.array(told).reshape(len(known), len(metrics)))
@@ -76,9 +76,9 @@ def front_of(points: Sequence[Point], metrics: Sequence[str]) -> list[Point]:
 def hypervolume_history(
     points: Sequence[Point], reference: Mapping[str, float], objectives: Sequence[str]
 ) -> Float64:
-    """(n,) share of the box from 0 to the reference that the feasible among the first k dominate.
+    """(n,) share of the box from 0 to the reference dominated by feasible points so far.
 
-    Zitzler and Thiele's hypervolume, over that of the box; it never falls.
+    Zitzler and Thiele's hypervolume divided by the volume of the box; it never decreases.
     """
     corner = np.array([reference[name] for name in objectives])
     history = np.zeros(len(points))
@@ -91,7 +91,7 @@ def hypervolume_history(
 
 
 def hypervolume(values: ArrayLike, reference: ArrayLike) -> float:
-    """Volume of what points (n, d) dominate up to ``reference`` (d,); smaller is better."""
+    """Volume dominated by points (n, d) up to ``reference`` (d,); smaller values are better."""
     from optuna._hypervolume import compute_hypervolume
 
     points = np.asarray(values, dtype=np.float64)
@@ -101,9 +101,9 @@ def hypervolume(values: ArrayLike, reference: ArrayLike) -> float:
 
 
 def importances(storage: StudyStorage) -> dict[str, dict[str, float]]:
-    """Share of each parameter in what makes a good value, by objective.
+    """Importance of each parameter for good values of each objective, as shares.
 
-    PED-ANOVA (Watanabe, Bansal, Hutter, IJCAI 2023). Empty while there are too few trials.
+    Uses PED-ANOVA (Watanabe, Bansal, Hutter, IJCAI 2023). Empty if there are too few trials.
     """
     from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 
@@ -114,7 +114,7 @@ def importances(storage: StudyStorage) -> dict[str, dict[str, float]]:
     for index, name in enumerate(storage.settings.objectives):
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that low values are taken as good: they are
+                warnings.simplefilter("ignore")  # low values are good, as intended
                 shares = get_param_importances(
                     storage.study, evaluator=PedAnovaImportanceEvaluator(), target=target(index)
                 )

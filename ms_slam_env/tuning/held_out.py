@@ -1,7 +1,7 @@
-"""The chosen configurations against the default, side by side on the same sequences.
+"""Compare the chosen configurations with the default on the same sequences.
 
-On those that the exploration never saw, and once more on its own: a configuration that was measured
-once may be the best by chance.
+The comparison uses sequences that the exploration never saw, and its own once more, because a
+configuration that was measured once may be the best by chance.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ COMPARED = ("ate_m", "ext_ms", "load_ms")
 
 @dataclass(frozen=True)
 class _Run:
-    """One configuration on one sequence; what decides its result, and so its key."""
+    """One configuration on one sequence: the inputs that determine its result, and so its key."""
 
     evaluator: SlamEvaluator
     configuration: SlamConfiguration
@@ -41,22 +41,22 @@ def compare_configurations(
     sequences: Sequence[str],
     path: Path,
 ) -> list[dict[str, Any]]:
-    """Run every configuration on every sequence, in turn, so that none has a quieter machine.
+    """Run every configuration on every sequence, interleaved so that machine load affects all.
 
-    Runs that are in the file ``path`` already are not repeated.
+    Runs already in the file ``path`` are not repeated.
 
     Raises:
         InputError: the file holds something else.
 
     Returns:
-        a line for each configuration: the keys of ``COMPARED`` (means over the sequences), with
-        ``_ratio`` the interval of these to the default's, by a bootstrap over the sequences;
-        ``worst_ate_ratio``, ``failed_runs`` and ``sequences_count``. Sequences on which
-        either failed have no part in means and ratios.
+        a line for each configuration: the keys of ``COMPARED`` (means over the sequences); with
+        the suffix ``_ratio``, the interval of their ratio to the default's, by a bootstrap over the
+        sequences; ``worst_ate_ratio``, ``failed_runs`` and ``sequences_count``. Sequences on which
+        either failed are left out of means and ratios.
     """
     records = RecordFile(path)
     done = records.load()
-    for key, row in done.items():  # the file may be a stranger's
+    for key, row in done.items():  # the file is untrusted
         if not is_measured(row):
             raise InputError(f"{path}: row {key} holds no measures of a run")
     rows: dict[str, list[Row]] = {name: [] for name in configurations}

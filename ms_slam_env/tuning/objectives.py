@@ -1,4 +1,4 @@
-"""What is minimised, what is demanded, and what a failed evaluation counts as."""
+"""Objectives and constraints of an exploration, and the values of a failed evaluation."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Measured = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of an evaluation.
+    """A quantity that an evaluation measures.
 
     Attributes:
-        key: in the registry of metrics, by which results are written.
-        worst: what counts where nothing better is known, as samplers are told it.
-        is_error: whether it says nothing of a run that lost track.
-        wall_key: in place of ``key`` where time is measured by the clock.
-        scale: from the objective's unit to the registry's.
-        is_larger_better: of what a configuration copes with. All objectives are minimised: samplers
-            are told the reciprocal, which leaves the Pareto front as it is.
+        key: key in the metric registry, used in results.
+        worst: value used if nothing better is known, as passed to samplers.
+        is_error: whether it is meaningless for a run that lost track.
+        wall_key: key instead of ``key`` if time is measured by the clock.
+        scale: factor from the objective's unit to the registry's.
+        is_larger_better: whether larger is better. Since all objectives are minimised, samplers
+            receive the reciprocal, which does not change the Pareto front.
     """
 
     key: str
@@ -38,7 +38,7 @@ class Metric:
     is_larger_better: bool = False
 
     def told(self, value: float) -> float:
-        """``value`` as samplers are told it, the less the better; and back again."""
+        """Convert ``value`` to the form passed to samplers (less is better), or back."""
         if not self.is_larger_better:
             return value
         return 1.0 / value if value > 0 else self.worst
@@ -59,25 +59,25 @@ METRICS: dict[str, Metric] = {
     "M_I": Metric("M_I", 1e6, True, is_larger_better=True),
     "M_D": Metric("M_D", 1e6, True, is_larger_better=True),
 }
-"""What an evaluation can measure and an exploration can want: the least, of the divergences M_I and
-M_D (equations 11 and 12) that a configuration copes with the most."""
+"""Metrics that an evaluation can measure. An exploration minimises them, except for the divergences
+M_I and M_D (equations 11 and 12) that a configuration copes with, which it maximises."""
 
 FAILURE = "failure"
-"""Key of an evaluation under which it says, in words, why it measured less than it should."""
+"""Key of an evaluation's text that says why it measured less than it should."""
 
 
 OTHERS = ("ate_tracked_m", "tracked_share", "largest_change", "frames", FAILURE)
-"""What else an evaluation may return, under the registry's own names."""
+"""Further keys that an evaluation may return, with the registry's names."""
 
 
 def key_of(name: str, clock: str) -> str:
-    """The key in the registry of metric ``name``, time measured by ``processor`` or ``wall``."""
+    """Registry key of metric ``name`` if time is measured by ``clock``, processor or wall."""
     metric = METRICS[name]
     return (clock == "wall" and metric.wall_key) or metric.key
 
 
 def as_metrics(measured: Measured, clock: str) -> dict[str, Any]:
-    """What an evaluation returned, by keys and in units of the registry; None where unknown."""
+    """Results of an evaluation with the registry's keys and units; None if unknown."""
     found: dict[str, Any] = {}
     for name, metric in METRICS.items():
         if name in measured:
@@ -88,7 +88,7 @@ def as_metrics(measured: Measured, clock: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Constraint:
-    """``metric`` may not exceed ``limit``; with ``at_least`` it may not fall below it."""
+    """``metric`` must not exceed ``limit`` or, with ``at_least``, must not be below it."""
 
     metric: str
     limit: float
@@ -98,9 +98,9 @@ class Constraint:
         return f"{self.metric}{'>' if self.at_least else '<'}{repr(self.limit).removesuffix('.0')}"
 
     def violation(self, measured: Measured) -> float:
-        """By how much of the limit it is broken; 0 or less if it is kept.
+        """Violation of the constraint relative to the limit; 0 or less if it is met.
 
-        What was not measured breaks it by as much as the worst value does.
+        A value that was not measured counts as the worst value.
         """
         value = measured.get(self.metric)
         if value is None or not math.isfinite(value):
@@ -110,10 +110,10 @@ class Constraint:
 
 
 def parse_constraint(text: str) -> Constraint:
-    """Read ``metric<limit``; of M_I and M_D, which say how hard a sequence is, ``>`` as well.
+    """Parse ``metric<limit``; for M_I and M_D, which say how hard a sequence is, also ``>``.
 
     Raises:
-        InputError: no such form, or an unknown metric.
+        InputError: malformed text, or an unknown metric.
     """
     name, sign, limit = [*re.split("([<>])=?", text, maxsplit=1), "", ""][:3]
     name = name.strip()
@@ -138,11 +138,11 @@ def parse_constraint(text: str) -> Constraint:
 def objective_values(
     measured: Measured, objectives: Sequence[str], reference: Mapping[str, float]
 ) -> list[float]:
-    """What the sampler is told of each objective: finite, and never above ``reference`` (told too).
+    """Value of each objective for the sampler: finite, and at most ``reference`` in the same form.
 
-    A run that failed counts as the reference in everything that speaks of errors: the trajectory of
-    a camera that got lost may lie near the true one by chance. What it took still counts, where it
-    was measured: a sampler learns from that.
+    In a failed run, all errors count as the reference, since the trajectory of a lost camera may be
+    close to the true one by chance. Measured costs still count, because a sampler can learn from
+    them.
     """
     failed = bool(measured.get(FAILURE))
     values = []
@@ -156,7 +156,7 @@ def objective_values(
 
 
 def on_front(values: Float64) -> Bool:
-    """(n,) which of ``values`` (n, d) no other beats: as small in all, and smaller in one."""
+    """Mask (n,) of the ``values`` (n, d) that no other beats: none is <= in all and < in one."""
     beaten = [
         np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1)) for own in values
     ]

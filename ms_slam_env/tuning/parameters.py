@@ -1,4 +1,4 @@
-"""Kinds of parameters: what values each may take."""
+"""Kinds of parameters and their allowed values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Parameter(ABC):
-    """The values that a parameter may take."""
+    """Set of values that a parameter may take."""
 
     @abstractmethod
     def distribution(self) -> BaseDistribution:
@@ -26,7 +26,7 @@ class Parameter(ABC):
 
     @abstractmethod
     def ends(self) -> tuple[Any, ...]:
-        """The extreme values, or all where there is no order."""
+        """The extreme values, or all values if they have no order."""
 
     @abstractmethod
     def __str__(self) -> str:
@@ -46,7 +46,7 @@ class _Range(Parameter):
     log: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what holds no values."""
+        """Refuse an empty or invalid range."""
         if not self.low < self.high or (self.log and not self.low > 0):
             raise InputError(f"range {self.low}:{self.high} holds no values")
 
@@ -93,13 +93,13 @@ class Choice(Parameter):
     """One of several values, without order.
 
     Raises:
-        InputError: fewer than two, or one twice.
+        InputError: fewer than two values, or a value given twice.
     """
 
     values: tuple[Any, ...]
 
     def __post_init__(self) -> None:
-        """Refuse what leaves no choice."""
+        """Refuse fewer than two values, and duplicates."""
         if len(self.values) < 2 or len(set(map(repr, self.values))) < len(self.values):
             raise InputError(f"values {self} must be two or more, each once")
 

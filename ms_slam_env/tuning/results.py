@@ -1,4 +1,4 @@
-"""What came of an exploration: rows, tables and charts."""
+"""Results of an exploration: rows, tables and charts."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ _TRIALS_PER_PARAMETER = 10
 
 @dataclass(frozen=True)
 class Explored:
-    """What came of an exploration.
+    """Results of an exploration.
 
     Attributes:
         objectives: names in ``METRICS``.
-        clock: that time was measured by.
-        parameters: names.
+        clock: clock that measured time.
+        parameters: names of the parameters.
         points: the finished trials.
         chosen: points of the front by purpose.
-        reference: where each objective stops to count.
+        reference: largest value of each objective that still counts.
         hypervolume: after each trial, as a share of the box up to the reference.
-        importance: by objective, the share of each parameter.
+        importance: share of each parameter, by objective.
         held_out: lines of ``compare_configurations`` on sequences that it never saw.
-        again: the same of the default and the chosen on its own sequences.
-        absent: parameters of the groups asked for that this machine or the backend lacks; lines.
+        again: such lines for the default and the chosen ones on its own sequences.
+        absent: lines about parameters of requested groups that this machine or the backend lacks.
         levels: trials that run-time adaptation may switch among, from fast to robust.
     """
 
@@ -68,7 +68,7 @@ class Explored:
     levels: Sequence[int] = ()
 
     def rows(self) -> list[dict[str, Any]]:
-        """One a trial."""
+        """One row per trial."""
         return [
             {
                 "spec": {"trial": point.number, "params": point.params},
@@ -115,7 +115,7 @@ class Explored:
         return make_table(("trial", "purpose", *known, *values), lines, note=self._counts())
 
     def _purposes(self) -> dict[int, str]:
-        """By number of a trial what it is besides one of the front: fastest and knee, say."""
+        """Trial number to its purposes, for example fastest and knee."""
         names: dict[int, list[str]] = {}
         default = [("default", point) for point in self.points if point.is_default]
         of_level = {f"level {k}": self._by_number(n) for k, n in enumerate(self.levels)}
@@ -150,7 +150,7 @@ class Explored:
         return make_table(columns, lines, title, note)
 
     def _by_chance(self) -> str:
-        """Which of the chosen may be better than the default by chance alone."""
+        """Note on the chosen configurations that may be better than the default by chance."""
         if max(line["sequences_count"] for line in self.again) < 2:
             return "Of one sequence: whether chance made a difference is not known."
         lines = {line["configuration"]: line for line in self.again}
@@ -247,7 +247,7 @@ class Explored:
         return list(combinations(self.objectives, 2))
 
     def _by_rate(self, error: str, cost: str, rates: Sequence[int]) -> Panel:
-        """The front of each frame rate with the divergence that it makes: Figs. 6 and 7."""
+        """The front at each frame rate, labelled with its divergence, as in Figs. 5 and 6."""
         series = []
         for every in rates:
             own = [p for p in self.points if p.params.get(_RATE, 1) == every and p.feasible]
@@ -296,7 +296,7 @@ class Explored:
 
 
 def by_importance(importance: Shares) -> list[str]:
-    """Names of the parameters, the most important for any objective first."""
+    """Names of the parameters, by importance for any objective, largest first."""
     names = next(iter(importance.values()))
     return sorted(names, key=lambda name: -max(shares[name] for shares in importance.values()))
 

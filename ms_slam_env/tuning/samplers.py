@@ -1,4 +1,4 @@
-"""What proposes the configurations to be tried out: Optuna's samplers and one more."""
+"""Samplers, which propose the configurations to try: Optuna's and one more."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def _tpe(seed: int, population: int) -> BaseSampler:
 def _gp(seed: int, population: int) -> BaseSampler:
     """Gaussian processes, on one thread.
 
-    PyTorch's pool and OpenBLAS's take each other's cores: on two busy cores a proposal took 8.7 s,
-    2.5 s of processor time, and studies did not finish; on one thread it took 1.2 s and 0.4 s
-    (seven parameters, a constraint, 10 to 30 trials).
+    The thread pools of PyTorch and OpenBLAS compete for cores. On two busy cores a proposal took
+    8.7 s (2.5 s of processor time), and studies did not finish; on one thread it took 1.2 s (0.4 s
+    of processor time), with seven parameters, a constraint, and 10 to 30 trials.
     """
     from optuna.samplers import GPSampler
     from threadpoolctl import threadpool_limits
@@ -61,7 +61,7 @@ def _forest(seed: int, population: int) -> BaseSampler:
     from optuna.trial import TrialState
 
     class RandomForestSampler(BaseSampler):
-        """``propose`` after the first trials, which are random."""
+        """Uses ``propose`` after the first, random trials."""
 
         def __init__(self) -> None:
             self._rng = np.random.default_rng(seed)
@@ -89,7 +89,7 @@ SAMPLERS: dict[str, Maker] = {
     "gp": _gp,
     "forest": _forest,
 }
-"""Name to maker; a maker takes the seed and the size of a population.
+"""Name to a function that makes the sampler from a seed and a population size.
 
 ``random`` is the paper's; ``nsga2`` evolves a population; ``tpe``, ``gp`` and ``forest`` fit a
 model, the last as HyperMapper does.
@@ -115,29 +115,29 @@ def make_sampler(name: str, seed: int, population: int) -> BaseSampler:
 
 # -- Active learning with random forests --------------------------------------------------------
 
-_STARTUP = 10  # random trials before there is a model
-_AT_RANDOM = 0.05  # of the later ones: a model that is wrong somewhere learns of it
-_POOL = 1000  # random configurations that are predicted, and as many close to the front
+_STARTUP = 10  # random trials before the first model
+_AT_RANDOM = 0.05  # share of random trials later on, which reveal errors of the model
+_POOL = 1000  # random configurations to predict, and as many close to the front
 _TREES = 32
-_LIKELY = 0.5  # probability from which on a configuration is taken for feasible
+_LIKELY = 0.5  # least probability at which a configuration counts as feasible
 
 
 def propose(space: Mapping[str, Any], done: list[Any], rng: np.random.Generator) -> dict[str, Any]:
-    """The next configuration: at random of the Pareto front that random forests predict.
+    """Propose a random configuration from the Pareto front that random forests predict.
 
-    One forest predicts each objective, another whether a configuration is feasible: whether it
-    keeps the constraints and does not fail. Nardi, Koeplinger, Olukotun: Practical Design Space
-    Exploration (HyperMapper), MASCOTS 2019; there all of the predicted front is evaluated before
-    the forests grow anew, here one at a time. A pool of configurations stands for the space, half
-    of them drawn from it, half changed from the front so far.
+    One forest predicts each objective, another whether a configuration is feasible, that is, meets
+    the constraints and does not fail. Nardi, Koeplinger, Olukotun: Practical Design Space
+    Exploration (HyperMapper), MASCOTS 2019. There the whole predicted front is evaluated before the
+    forests are refitted; here it is one configuration at a time. A pool of configurations
+    represents the space: half are drawn from it, half are variations of the current front.
 
     Args:
         space: Optuna's distributions by name.
-        done: finished trials of Optuna.
-        rng: what chance there is.
+        done: Optuna's finished trials.
+        rng: random generator.
 
     Returns:
-        values of ``space``.
+        a value for each name in ``space``.
     """
     from optuna._transform import _SearchSpaceTransform
     from sklearn.ensemble import RandomForestClassifier, RandomForestRegressor
@@ -170,7 +170,7 @@ def propose(space: Mapping[str, Any], done: list[Any], rng: np.random.Generator)
 
 
 def _changed(best: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """(_POOL, d) of points (n, d), one or two coordinates of each drawn anew or shifted."""
+    """Variations (_POOL, d) of points (n, d), with one or two coordinates redrawn or shifted."""
     rows = best[rng.integers(len(best), size=_POOL)]
     drawn = np.where(
         rng.random(rows.shape) < 0.5,

@@ -1,4 +1,4 @@
-"""What an exploration is: decided once, kept with the study, and the same when it goes on."""
+"""Settings of an exploration, which are stored with the study and must not change on resuming."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from ms_slam_env.tuning.samplers import SAMPLERS
 from ms_slam_env.tuning.space import SearchSpace
 
 Evaluate = Callable[[SlamConfiguration], Measured]
-"""Measures a configuration: values of ``METRICS`` by name, ``M_I`` and ``M_D``, and ``failure``, in
-words, where SLAM failed. It is called in other processes, and so must be picklable. What it raises
-stops the exploration; a failure of SLAM it returns."""
+"""Measures a configuration: returns values of ``METRICS`` by name, ``M_I`` and ``M_D``, and a text
+``failure`` if SLAM failed. It is called in other processes, so it must be picklable. An exception
+stops the exploration; a failure of SLAM is returned instead."""
 
 
 @dataclass(frozen=True)
 class ExplorationSettings(Checked):
-    """What decides the trials of a study.
+    """Settings that determine the trials of a study.
 
     Attributes:
         objectives: names in ``METRICS``, two or more.
-        constraints: such as ``ate_m<0.01``.
+        constraints: texts such as ``ate_m<0.01``.
         sampler: random, nsga2, tpe, gp or forest.
-        seed: of the sampler.
-        population: of NSGA-II.
-        reference_factor: results worse than so many times the default's count as that; the volume
-            that the front dominates is measured from there.
-        reference: where each objective stops to count, instead of that multiple.
-        context: whatever else decides what the evaluation measures, such as the sequences.
+        seed: seed of the sampler.
+        population: population size of NSGA-II.
+        reference_factor: values are capped at this multiple of the default's, which is also the
+            reference point for the volume that the front dominates.
+        reference: cap of each objective, instead of that multiple.
+        context: everything else that determines the measurements, such as the sequences.
 
     Raises:
         InputError: an unknown name, or a value out of range.
@@ -43,12 +43,12 @@ class ExplorationSettings(Checked):
     sampler: str = chosen("tpe", *SAMPLERS)
     seed: int = bounded(0, 0, 2**31)
     population: int = bounded(16, 2, 10_000)
-    reference_factor: float = bounded(3.0, 1.01, 1000.0)  # the default itself lies inside
+    reference_factor: float = bounded(3.0, 1.01, 1000.0)  # so that the default lies inside
     reference: dict[str, float] = field(default_factory=dict)
     context: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse what no study could use."""
+        """Refuse settings that no study could use."""
         super().__post_init__()
         for name in self.objectives:
             if name not in METRICS:
@@ -64,7 +64,7 @@ class ExplorationSettings(Checked):
         return [parse_constraint(text) for text in self.constraints]
 
     def fingerprint(self, space: SearchSpace) -> dict[str, Any]:
-        """Everything that must be the same when the study goes on, as text."""
+        """Everything that must not change when the study resumes, as text."""
         content = {
             **asdict(self),
             "parameters": {name: str(kind) for name, kind in space.parameters.items()},

@@ -35,7 +35,7 @@ _ALGORITHM: dict[str, Parameter] = {
     "unstable_window": Integer(10, 400, log=True),
 }
 _MOTION: dict[str, Parameter] = {"keep_every": Integer(1, 6)}
-# What a processed frame costs: pyramid, iterations, points, and how fine and how large the map is.
+# Parameters that decide the cost of a frame: pyramid, iterations, points, map resolution and size.
 _FRAME: dict[str, Parameter] = {
     "pyramid_levels": Integer(1, 3),
     **{name: _ALGORITHM[name] for name in ("iterations.0", "iterations.1", "iterations.2")},
@@ -78,7 +78,7 @@ _KINECT_FUSION: dict[str, Parameter] = {
 }
 _OF_SURFELS = {**_ALGORITHM, **_MOTION, **_FRAME, **_OTHERS, **_COMPILER}
 KNOWN: dict[str, Parameter] = {**_OF_SURFELS, **_KINECT_FUSION}
-"""Parameters of the surfel backend, and of kinectfusion, that have a range of their own."""
+"""Parameters of the backends surfel and kinectfusion that have a default range."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "paper": tuple(_PAPER),
@@ -88,8 +88,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "machine": ("threads", "device", "cpu_mhz", "gpu_mhz", "precision"),
     "kinectfusion": (*_KINECT_FUSION, "iterations.0", "iterations.1", "iterations.2"),
 }
-"""Names that stand for several parameters; those that a machine or a backend has not are left out
-of ``compiler`` and ``machine`` (``why_absent``)."""
+"""Group names to their parameters; ``compiler`` and ``machine`` leave out those that the machine
+or the backend lacks (see ``why_absent``)."""
 
 _OF_CONFIGURATION = ("image_size", "keep_every", "threads", "cpu_mhz")
 _LEVELS = "pyramid_levels"
@@ -100,21 +100,21 @@ _COMPILER_PREFIX = "compiler."
 class SearchSpace:
     """Parameters by name, and the configuration that they start from.
 
-    Names are those of the backend, with dots for nested ones and for places of a list
-    (``iterations.0``), ``pyramid_levels`` for how many of the ``iterations`` count,
-    ``image_size``, ``keep_every``, ``threads`` and ``cpu_mhz`` of the configuration, or
-    ``compiler.`` and an option.
+    Names are those of the backend, with dots for nested parameters and for list items
+    (``iterations.0``); ``pyramid_levels`` for the number of ``iterations`` in use; ``image_size``,
+    ``keep_every``, ``threads`` and ``cpu_mhz`` of the configuration; or ``compiler.`` and an
+    option.
 
     Raises:
-        InputError: no parameter, one that the backend does not have, one whose range does not hold
-            the value that it starts from, or a value that the backend refuses.
+        InputError: no parameter, one that the backend does not have, one whose range excludes its
+            start value, or a value that the backend refuses.
     """
 
     parameters: Mapping[str, Parameter]
     base: SlamConfiguration = dataclasses.field(default_factory=SlamConfiguration)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be explored."""
+        """Refuse parameters that cannot be explored."""
         if not self.parameters:
             raise InputError("no parameter to explore")
         for name, value in self.defaults().items():
@@ -136,7 +136,7 @@ class SearchSpace:
         return {name: parameter.distribution() for name, parameter in self.parameters.items()}
 
     def configuration(self, values: Mapping[str, Any]) -> SlamConfiguration:
-        """The base with ``values`` in the place of its own.
+        """The base configuration with ``values`` replaced.
 
         Raises:
             InputError: values that the backend refuses.
@@ -155,7 +155,7 @@ class SearchSpace:
         return dataclasses.replace(self.base, slam_config=params, compiler=compiler, **direct)
 
     def _nested(self, name: str, value: Any, params: dict[str, Any]) -> Any:
-        """Options that set ``name``, the other places of its list as in ``params``."""
+        """Options that set ``name``, with the other items of its list taken from ``params``."""
         *path, last = name.split(".")
         if last.isdigit():
             listed = ".".join(path)
@@ -168,7 +168,7 @@ class SearchSpace:
 
 
 def default_of(name: str, base: SlamConfiguration) -> Any:
-    """Value of parameter ``name`` in ``base``: given there, or the backend's own default.
+    """Value of parameter ``name`` in ``base``, or the backend's default if it is not set there.
 
     Raises:
         InputError: no such parameter.
@@ -199,14 +199,15 @@ def default_of(name: str, base: SlamConfiguration) -> Any:
 
 
 def make_space(texts: Sequence[str], base: SlamConfiguration | None = None) -> SearchSpace:
-    """The space that texts name: ``NAME``, ``NAME=low:high``, ``NAME=a,b,c``, or a group.
+    """Make a space from texts: ``NAME``, ``NAME=low:high``, ``NAME=a,b,c``, or a group.
 
-    A range of integers stays one where the parameter's value is an integer; ``low:high:log`` makes
-    equal ratios equally likely. Of a group what this machine or the backend lacks is left out.
+    The range holds only integers if the parameter's default is an integer; ``low:high:log`` makes
+    equal ratios equally likely. Parameters of a group that this machine or the backend lacks are
+    left out.
 
     Raises:
-        InputError: an unknown parameter, one that is absent here, one without a known range, or a
-            range that is none.
+        InputError: an unknown parameter, one that is not available here, one without a known range,
+            or an invalid range.
     """
     base = base or SlamConfiguration()
     parameters: dict[str, Parameter] = {}
@@ -233,7 +234,7 @@ def make_space(texts: Sequence[str], base: SlamConfiguration | None = None) -> S
 
 
 def absences(texts: Sequence[str], base: SlamConfiguration) -> list[str]:
-    """Of the groups among ``texts`` what is absent here, a line for each reason why."""
+    """Parameters of the groups in ``texts`` that are not available here, one line per reason."""
     members = [member for text in texts for member in GROUPS.get(text, ())]
     absent: dict[str, list[str]] = {}
     for member in members:
@@ -278,7 +279,7 @@ _ON_A_GPU = {"compiler.vectorise": "it is an option of the CPU's compiler, and t
 
 
 def why_absent(name: str, base: SlamConfiguration) -> str:
-    """Why parameter ``name`` does nothing to ``base`` on this machine; empty where it does."""
+    """Why parameter ``name`` has no effect on ``base`` on this machine; empty if it has one."""
     is_surfel = base.slam == "surfel"
     if name.startswith("compiler.") and not is_surfel:
         return f"backend {base.slam!r} takes no options of the compiler"

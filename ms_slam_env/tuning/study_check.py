@@ -1,4 +1,4 @@
-"""What a study must hold before it is gone on with: its file may come from a stranger."""
+"""Check a study's file before resuming it, since it may come from an untrusted source."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ if TYPE_CHECKING:
 
 DEFAULT, OWNER, RETRY_OF, RETRIES = "default", "owner", "retry_of", "retries"
 """User attributes of a trial: whether its values are the defaults, which process works on it, the
-number of the trial that it repeats, and how often that has been repeated."""
+number of the trial that it repeats, and how often that trial has been repeated."""
 MEASURED = "measured"
 """User attribute of a finished trial: everything that its evaluation returned."""
 REFERENCE = "reference"
-"""User attribute of a study: where each objective stops to count."""
+"""User attribute of a study: largest value of each objective that still counts."""
 
 _NUMBERS = {*METRICS, *OTHERS} - {FAILURE}
 _PROCESS = re.compile(r"[^/]*/[0-9]{1,10}/([0-9]{0,20}|ended)")
 
 
 Schema = frozenset[tuple[str, str, str, str]]
-"""Type, name and table of everything in a database, and the SQL that makes it."""
+"""Type, name and table of every object in a database, and the SQL that creates it."""
 
 
 def check_schema(path: Path) -> None:
-    """Refuse a database that has not just Optuna's tables and indices, before it is used.
+    """Refuse a database with other objects than Optuna's tables and indices, before using it.
 
     A trigger, a view or a constraint would run whenever Optuna reads or writes.
 
     Raises:
-        ValueError: what it has that is not Optuna's, what it lacks, or how it is broken.
-        sqlite3.Error: it is no database.
+        ValueError: foreign, missing or broken objects; the message says which.
+        sqlite3.Error: not a database.
     """
     file = f"{path.absolute().as_uri()}?mode=ro"
     with contextlib.closing(sqlite3.connect(file, uri=True)) as connection:
@@ -60,7 +60,7 @@ def check_schema(path: Path) -> None:
 
 
 def empty_study() -> bytes:
-    """A database with Optuna's tables and no study, with a write-ahead log."""
+    """Content of a database with Optuna's tables, no study, and a write-ahead log."""
     return _made_by_optuna()[0]
 
 
@@ -87,10 +87,10 @@ def _schema(connection: sqlite3.Connection) -> Schema:
 
 
 def check_study(study: Study, space: SearchSpace, objectives: Iterable[str]) -> None:
-    """Refuse what no exploration with these parameters and objectives wrote.
+    """Refuse a study that no exploration with these parameters and objectives wrote.
 
     Raises:
-        ValueError: what is wrong, and in which trial.
+        ValueError: a fault; the message names it and the trial.
     """
     from optuna.study import StudyDirection
 
@@ -112,7 +112,7 @@ def check_study(study: Study, space: SearchSpace, objectives: Iterable[str]) -> 
 def _complaints(
     trial: FrozenTrial, space: SearchSpace, names: list[str], has_reference: bool
 ) -> Iterator[str]:
-    """What is wrong with a trial."""
+    """Faults of a trial."""
     from optuna.trial import TrialState
 
     own = trial.user_attrs
@@ -138,7 +138,7 @@ def _complaints(
 
 
 def _is_in(space: SearchSpace, params: Any) -> bool:
-    """Whether these are values of some of the parameters."""
+    """Whether ``params`` are valid values of some of the parameters."""
     return isinstance(params, Mapping) and all(
         name in space.parameters and space.parameters[name].contains(value)
         for name, value in params.items()
@@ -146,7 +146,7 @@ def _is_in(space: SearchSpace, params: Any) -> bool:
 
 
 def is_measured(measured: Any) -> bool:
-    """Whether an evaluation may have returned this."""
+    """Whether an evaluation can have returned ``measured``."""
     if not isinstance(measured, Mapping) or not isinstance(measured.get(FAILURE, ""), str):
         return False
     return all(
@@ -155,7 +155,7 @@ def is_measured(measured: Any) -> bool:
 
 
 def _is_numbers(values: Any, names: Iterable[Any]) -> bool:
-    """Whether these are finite numbers under these names."""
+    """Whether ``values`` are finite numbers with these ``names``."""
     return (
         isinstance(values, Mapping)
         and set(values) == set(names)

@@ -1,7 +1,7 @@
-"""A study on disk: trials are handed out, told, and taken back from processes that died.
+"""A study on disk: hand out trials, store their results, and take them back from dead processes.
 
-One SQLite file, because a killed process leaves nothing behind there: the system drops its locks
-and SQLite undoes what it had half written. Optuna's journal keeps half a line and a lock file.
+It is one SQLite file, which survives killed processes: the system releases their locks and SQLite
+rolls back incomplete writes. Optuna's journal would keep half a line and a lock file.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 STUDY_FILE, LOCK_FILE = "study.db", "study.lock"
 _NAME = "exploration"
-_MOST_RETRIES = 2  # of a trial whose process died; then its values may be what kills processes
+_MOST_RETRIES = 2  # of a trial whose process died; after that, its values may be the cause
 _LOCK_TIMEOUT_S = 600.0
 _MAX_BYTES = 2**30
 _DISK_ERRORS = {
@@ -62,15 +62,15 @@ _DISK_ERRORS = {
 
 
 class StudyStorage:
-    """The trials of one study; any number of processes may hold one of a folder.
+    """The trials of one study; any number of processes may open the same folder.
 
     Args:
-        folder: of the study; made if it is not there.
+        folder: folder of the study; created if missing.
         space: the parameters.
-        settings: of the exploration.
+        settings: settings of the exploration.
 
     Raises:
-        InputError: the folder holds a study with other settings, or no study file at all.
+        InputError: the folder holds a study with other settings, or its file is not a study.
         OSError: the disk is full, broken or read-only.
     """
 
@@ -84,10 +84,10 @@ class StudyStorage:
     # -- Handing out and taking in -----------------------------------------------------------
 
     def ask(self, budget: int) -> Trial | None:
-        """Hand out the next trial; None while ``budget`` trials are finished or in living hands.
+        """Hand out the next trial; None if ``budget`` trials are finished or running.
 
-        The default configuration is the first; while it has not finished there is no other,
-        because results are measured by it.
+        The first trial is the default configuration. No other is handed out until it has finished,
+        because results are measured relative to it.
         """
         from optuna.trial import TrialState
 
@@ -100,8 +100,8 @@ class StudyStorage:
                 return None
             if self.reference() is None and running:
                 return None
-            # A sampler for each trial, seeded by the trial's number: a study that goes on after an
-            # interruption draws what it would have drawn without.
+            # A new sampler per trial, seeded by the trial's number, so that a resumed study draws
+            # the same as one without an interruption.
             seed = np.random.SeedSequence([self.settings.seed, len(trials)]).generate_state(1)[0]
             self.study.sampler = make_sampler(
                 self.settings.sampler, int(seed), self.settings.population
@@ -111,7 +111,7 @@ class StudyStorage:
             return trial
 
     def tell(self, trial: Trial, measured: Measured) -> None:
-        """Finish ``trial`` with what its evaluation returned; no matter if it was taken back."""
+        """Finish ``trial`` with its results, even if it was taken back meanwhile."""
         from optuna.exceptions import UpdateFinishedTrialError
 
         with self._disk_errors(), contextlib.suppress(UpdateFinishedTrialError):
@@ -133,7 +133,7 @@ class StudyStorage:
         self.study.tell(trial, values, skip_if_finished=True)
 
     def give_up(self, trial: Trial, why: str) -> None:
-        """Mark ``trial`` as failed: its process died or could not work; it will be redone."""
+        """Mark ``trial`` as failed because its process died or could not work; it is repeated."""
         from optuna.trial import TrialState
 
         with self._disk_errors():
@@ -141,7 +141,7 @@ class StudyStorage:
             self.study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
 
     def configuration(self, trial: Trial | FrozenTrial) -> SlamConfiguration:
-        """What is to be evaluated."""
+        """The configuration to evaluate for ``trial``."""
         return self.space.configuration(trial.params)
 
     # -- Looking -----------------------------------------------------------------------------
@@ -154,7 +154,7 @@ class StudyStorage:
             return self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
 
     def reference(self) -> dict[str, float] | None:
-        """Where objectives stop to count, by name; None until the default has finished."""
+        """Largest value of each objective that counts; None until the default has finished."""
         return self.study.user_attrs.get(REFERENCE)
 
     # -- Inside ------------------------------------------------------------------------------
@@ -190,7 +190,7 @@ class StudyStorage:
         return study
 
     def _check_files(self, path: Path) -> None:
-        """Refuse files that SQLite would follow to others; a stranger may have made them."""
+        """Refuse untrusted files that would lead SQLite to other files."""
         for ending in ("", "-wal", "-shm"):
             check_own(Path(f"{path}{ending}"))
         journal = Path(f"{path}-journal")
@@ -203,7 +203,7 @@ class StudyStorage:
 
     @contextmanager
     def _checked(self) -> Iterator[None]:
-        """Let whatever Optuna stumbles over in a file be one line that names it."""
+        """Turn any error that a file causes in Optuna into one line that names the file."""
         try:
             with self._disk_errors():
                 yield
@@ -214,7 +214,7 @@ class StudyStorage:
             raise InputError(f"{self.folder / STUDY_FILE}: not a study: {line}") from None
 
     def _check_rows(self) -> None:
-        """Refuse rows of trials that are not there: a later trial would get their number."""
+        """Refuse rows of missing trials, which a later trial with that number would inherit."""
         with contextlib.closing(self._connect()) as connection:
             orphan = connection.execute("PRAGMA foreign_key_check").fetchone()
         if orphan:
@@ -235,14 +235,14 @@ class StudyStorage:
                 )
 
     def _take_back(self) -> None:
-        """Mark trials of dead processes as failed, and queue what was given up once more."""
+        """Mark trials of dead processes as failed, and queue failed trials again."""
         from optuna.trial import TrialState
 
         trials = self.study.get_trials(deepcopy=False)
         for trial in trials:
             owner = trial.user_attrs.get(OWNER)
-            # Without an owner: its process died between asking and signing, which happen under the
-            # lock that is held here.
+            # A trial without owner: its process died between taking and signing it, both of which
+            # happen under the lock held here.
             if trial.state == TrialState.RUNNING and (owner is None or not is_alive(owner)):
                 self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
         trials = self.study.get_trials(deepcopy=False)
@@ -273,9 +273,9 @@ class StudyStorage:
         return reference
 
     def _connect(self) -> sqlite3.Connection:
-        """A connection that is safe against the death of processes, at a fraction of the syncs.
+        """A connection that survives the death of processes, with few syncs to disk.
 
-        A loss of power may cost the last trials, never the file.
+        A power failure may lose the last trials, but never the file.
         """
         connection = sqlite3.connect(
             self.folder / STUDY_FILE, timeout=_LOCK_TIMEOUT_S, check_same_thread=False
@@ -287,17 +287,17 @@ class StudyStorage:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Hold the study's lock, for a moment."""
+        """Hold the study's lock."""
         with alone_in(self.folder, self.folder / LOCK_FILE, _LOCK_TIMEOUT_S), self._disk_errors():
             yield
 
     @contextmanager
     def _disk_errors(self) -> Iterator[None]:
-        """Let what SQLite says of its file, through two libraries, be one line that names it.
+        """Turn SQLite's errors, wrapped by two libraries, into one line that names the file.
 
         Raises:
-            OSError: of the disk.
-            InputError: all else that it says: no right to write, another kind of file.
+            OSError: an error of the disk.
+            InputError: any other error, such as no write permission or another kind of file.
         """
         path = self.folder / STUDY_FILE
         try:
@@ -315,7 +315,7 @@ class StudyStorage:
 
 
 def _plain(value: Any) -> Any:
-    """``value`` as JSON has it: NaN and infinity become None."""
+    """``value`` in JSON types: NaN and infinity become None."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""What SLAM costs a frame: execution time (EXT), memory (MEM), energy (ENE)."""
+"""Cost of SLAM per frame: execution time (EXT), memory (MEM), energy (ENE)."""
 
 from ms_slam_env.metrics.cost.energy import (
     EnergyCounter,

@@ -1,9 +1,10 @@
-"""Energy (ENE): of the processor from RAPL, of NVIDIA GPUs from NVML.
+"""Energy (ENE) of the processor, from RAPL, and of NVIDIA GPUs, from NVML.
 
-RAPL, the counters that Linux shows under powercap, is of the whole package: what else runs on the
-machine counts too. Layout and units: the kernel's Documentation/power/powercap/powercap.rst and
-ABI/testing/sysfs-class-powercap. NVML, the library below nvidia-smi, has the millijoules of the
-whole GPU since the driver was loaded, from the Volta generation on.
+RAPL counters, which Linux exposes under powercap, cover the whole package: everything else that
+runs on the machine counts too. Layout and units: the kernel's
+Documentation/power/powercap/powercap.rst and ABI/testing/sysfs-class-powercap. NVML, the library
+behind nvidia-smi, counts the millijoules of the whole GPU since the driver was loaded, from the
+Volta generation on.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from typing import Any
 
 
 class EnergyCounter(ABC):
-    """Energy that a part of the machine has taken.
+    """Counter of the energy used by one part of the machine.
 
     Attributes:
-        source: of the figures, in words.
-        reason: why there are none; empty while there are.
+        source: where the figures come from, in words.
+        reason: why there are no figures; empty while there are.
     """
 
     source: str = ""
@@ -29,11 +30,11 @@ class EnergyCounter(ABC):
 
     @abstractmethod
     def joules(self) -> float:
-        """Energy in joules since this counter was made; NaN once ``reason`` says why."""
+        """Energy in joules since this counter was created; NaN once it fails (see ``reason``)."""
 
 
 class NoEnergy(EnergyCounter):
-    """Counts nothing, for the ``reason`` given."""
+    """Counter without figures, for the given ``reason``."""
 
     def __init__(self, reason: str) -> None:
         self.reason = reason
@@ -45,8 +46,8 @@ class NoEnergy(EnergyCounter):
 
 POWERCAP = Path("/sys/class/powercap")
 
-# Zones of intel-rapl-mmio show the same counters a second time, psys contains the packages, and
-# the zones core and uncore are parts of theirs; dram is not.
+# Zones of intel-rapl-mmio repeat the same counters, psys contains the packages, and the zones core
+# and uncore are parts of a package; dram is separate.
 _ZONE = re.compile(r"intel-rapl:\d+(:\d+)?")
 _COUNTED = re.compile(r"package.*|dram")
 
@@ -56,7 +57,7 @@ class _UnreadableError(Exception):
 
 
 class _Zone:
-    """One counter of a processor package, or of the memory beside it."""
+    """Counter of one processor package, or of its memory."""
 
     def __init__(self, folder: Path) -> None:
         self._energy = folder / "energy_uj"
@@ -67,22 +68,22 @@ class _Zone:
     def joules(self) -> float:
         now_uj = _number(self._energy)
         passed = now_uj - self._last_uj
-        # The counter falls back to zero above its range, once an hour or less at 70 W. A second
-        # fall between two readings would go unnoticed: it is read at every frame.
+        # The counter wraps to zero at the end of its range, at most once an hour at 70 W. Two wraps
+        # between readings would go unnoticed, but it is read at every frame.
         self._total_uj += passed if passed >= 0 else passed + self._range_uj
         self._last_uj = now_uj
         return 1e-6 * self._total_uj
 
 
 class RaplCounter(EnergyCounter):
-    """All processor packages, with the memory beside them where the machine counts that."""
+    """Counter of all processor packages, and of their memory where the machine counts it."""
 
     def __init__(self, folders: list[Path]) -> None:
         self._zones = [_Zone(folder) for folder in folders]
         self.source = "RAPL: " + ", ".join(_text(folder / "name") for folder in folders)
 
     def joules(self) -> float:
-        """Energy in joules since this counter was made; NaN once a zone cannot be read."""
+        """Energy in joules since this counter was created; NaN once a zone cannot be read."""
         if self.reason:
             return math.nan
         try:
@@ -93,9 +94,9 @@ class RaplCounter(EnergyCounter):
 
 
 def rapl_counter(root: Path = POWERCAP) -> EnergyCounter:
-    """Count the energy of the processor packages below ``root``; `NoEnergy` where that is not so.
+    """Counter of the processor packages below ``root``, or `NoEnergy` if it cannot be read.
 
-    One package that cannot be read leaves no figure at all: a part would look like the whole.
+    One unreadable package means no figure at all, since a partial sum would look complete.
     """
     if not root.is_dir():
         return NoEnergy(f"{root} does not exist: no RAPL (a virtual machine, or not Linux)")
@@ -128,7 +129,7 @@ def _number(path: Path) -> int:
 
 
 class NvmlCounter(EnergyCounter):
-    """The GPUs that CUDA may use here; ``nvml`` is the module ``pynvml``, initialised."""
+    """Counter of the GPUs that CUDA may use; ``nvml`` is the initialised module ``pynvml``."""
 
     def __init__(self, nvml: Any, handles: list[Any]) -> None:
         self._nvml = nvml
@@ -142,7 +143,7 @@ class NvmlCounter(EnergyCounter):
         return sum(int(read(handle)) for handle in self._handles)
 
     def joules(self) -> float:
-        """Energy in joules since this counter was made; NaN once a GPU does not tell."""
+        """Energy in joules since this counter was created; NaN once a GPU cannot be read."""
         if self.reason:
             return math.nan
         try:
@@ -153,10 +154,10 @@ class NvmlCounter(EnergyCounter):
 
 
 def nvml_counter() -> EnergyCounter:
-    """Count the energy of the GPUs that ``CUDA_VISIBLE_DEVICES`` leaves; `NoEnergy` if none tells.
+    """Counter of the GPUs in ``CUDA_VISIBLE_DEVICES``, or `NoEnergy` if they cannot be read.
 
-    Its numbers are taken as NVML's, which are CUDA's where ``CUDA_DEVICE_ORDER=PCI_BUS_ID`` or all
-    GPUs are of one model.
+    Device numbers are interpreted as NVML's. They match CUDA's if ``CUDA_DEVICE_ORDER=PCI_BUS_ID``
+    or all GPUs are of one model.
     """
     try:
         import pynvml
@@ -173,7 +174,7 @@ def nvml_counter() -> EnergyCounter:
 
 
 def _visible(nvml: Any, listed: str | None) -> list[Any]:
-    """Handles of the GPUs listed by number or UUID, up to the first that is neither; None = all."""
+    """Handles of GPUs listed by number or UUID, up to the first other entry; None for all."""
     if listed is None:
         return [nvml.nvmlDeviceGetHandleByIndex(k) for k in range(nvml.nvmlDeviceGetCount())]
     handles = []
@@ -188,9 +189,9 @@ def _visible(nvml: Any, listed: str | None) -> list[Any]:
 
 
 def energy_counters(device: str = "cpu") -> dict[str, EnergyCounter]:
-    """Return the counters ``cpu`` and ``gpu`` of work on ``device``.
+    """Return the counters ``cpu`` and ``gpu`` for work on ``device``.
 
-    A GPU counts only where the work is on ``cuda``: what it draws while it idles is not the work's.
+    The GPU counts only for work on ``cuda``: its idle power is not caused by the work.
     """
     on_gpu = device.startswith("cuda")
     return {"cpu": rapl_counter(), "gpu": nvml_counter() if on_gpu else NoEnergy("not used")}

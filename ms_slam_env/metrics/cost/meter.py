@@ -1,7 +1,7 @@
-"""One meter for what SLAM costs, frame by frame.
+"""Meter of the cost of SLAM, frame by frame.
 
 Measures and their names: EXT, MEM and ENE of Saeedi et al., ICRA 2017, section II-A; USME (Qu,
-Zhang, Yang, Dong, Navigation Positioning and Timing 2021), section 1.4 (2), asks for memory by the
+Zhang, Yang, Dong, Navigation Positioning and Timing 2021), section 1.4 (2), asks for memory per
 frame and for energy.
 """
 
@@ -24,15 +24,15 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.cost.energy import EnergyCounter, energy_counters
 
 CORE_WATTS = 10.0
-"""Watts of a busy core in the stated model.
+"""Power in watts of a busy core in the energy model.
 
-No measurement of any machine: the thermal design power of server processors of the 2020s over their
-cores is 3 to 10 W, of laptops' 4 to 15 W. It ranks configurations by their processor time.
+Not measured on any machine: the thermal design power per core of processors of the 2020s is 3 to
+10 W in servers and 4 to 15 W in laptops. It ranks configurations by their processor time.
 """
 
 
 def memory_mb(name: str) -> float | None:
-    """Figure ``name`` of this process from Linux's status file, megabytes; None elsewhere."""
+    """Field ``name`` of this process's Linux status file, megabytes; None on other systems."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
@@ -44,7 +44,7 @@ def memory_mb(name: str) -> float | None:
 
 
 def resident_mb() -> float | None:
-    """Memory in use now, megabytes; the cheap way to the status file's VmRSS. None elsewhere."""
+    """Memory in use now, megabytes: VmRSS, read the fast way. None on other systems than Linux."""
     try:
         with open("/proc/self/statm", "rb") as file:
             pages = int(file.read().split()[1])
@@ -54,9 +54,9 @@ def resident_mb() -> float | None:
 
 
 def forget_peak_memory() -> float | None:
-    """Let the peak begin anew at what is in use now; return that, megabytes (proc(5)).
+    """Reset the peak memory to the memory in use now (proc(5)), and return that in megabytes.
 
-    Memory that was freed is handed back first: what is taken from it again would not be counted.
+    Freed memory is first returned to the system, since reusing it would not be counted.
     """
     gc.collect()
     try:
@@ -74,9 +74,9 @@ class FrameCost:
     Attributes:
         ext_s: execution time by the clock, seconds.
         cpu_s: processor time of all threads, seconds.
-        mem_mb: memory in use after the frame, above what was when the meter was made; NaN where
-            the system does not tell.
-        ene_j: energy of each counter, joules; NaN where there is none.
+        mem_mb: memory in use after the frame minus that when the meter was created, megabytes;
+            NaN if the system does not report it.
+        ene_j: energy of each counter, joules; NaN if it cannot be read.
     """
 
     ext_s: float
@@ -86,9 +86,9 @@ class FrameCost:
 
     @property
     def joules(self) -> float:
-        """Energy of all counters; NaN where one is missing, since a part would look as the whole.
+        """Energy of all counters; NaN if one is missing, since a partial sum would look complete.
 
-        A GPU that the work does not use has no counter to miss.
+        A GPU that the work does not use needs no counter.
         """
         return sum(self.ene_j.values()) if self.ene_j else math.nan
 
@@ -96,15 +96,15 @@ class FrameCost:
 class CostMeter:
     """Measures the frames that run inside ``with meter.frame():``.
 
-    Make it before the SLAM, so that what the SLAM allocates at the start counts: the process's
-    peak of memory begins anew here, so that of two meters in one process only the later one's
-    peak holds.
+    Create it before the SLAM system, so that the system's initial allocations count. The meter
+    resets the process's peak memory: of two meters in one process, only the later one's peak is
+    valid.
 
     Args:
-        device: that the work runs on, ``cpu`` or ``cuda``.
-        counters: of energy, by name; those of the machine if None.
-        core_watts: of the stated model that stands where no counter can be read: energy is
-            processor time times this. Its figures have keys of their own.
+        device: device that the work runs on, ``cpu`` or ``cuda``.
+        counters: energy counters by name; None for those of the machine.
+        core_watts: power of a core, in watts, for the model used where no counter can be read:
+            energy is processor time times this. Its figures have separate keys.
 
     Raises:
         InputError: watts that are not positive.
@@ -126,7 +126,7 @@ class CostMeter:
 
     @contextmanager
     def frame(self) -> Iterator[None]:
-        """Measure the enclosed work as one frame; work that raises is not counted."""
+        """Measure the enclosed work as one frame; work that raises an exception does not count."""
         energy = {name: counter.joules() for name, counter in self._counters.items()}
         clock, processor = time.perf_counter(), time.process_time()
         yield
@@ -138,21 +138,24 @@ class CostMeter:
         self.frames.append(FrameCost(ext_s, cpu_s, mem, {name: taken[name] for name in self._used}))
 
     def summary(self, skip: int = 0) -> dict[str, Any]:
-        """Costs by flat names; None where a figure cannot be had.
+        """Costs by metric key; None for a figure that is not available.
 
-        ``ext_ms`` (mean a frame, by the clock), ``ext_ms_median``, ``_p95``, ``_p99``, ``_max``;
-        ``cpu_ms_mean`` (processor time of all threads), ``cpu_ms_median``, ``cpu_ms_p95``;
-        ``mem_peak_mb`` and ``mem_mb`` (peak, and mean over the frames, above what was in use when
-        the meter was made: the SLAM's own), ``mem_process_mb`` (peak of the whole process);
-        ``ene_j`` (of the frames together), ``ene_frame_j`` (mean), both None where a counter of
-        what was used is missing, ``ene_cpu_j``, ``ene_gpu_j``
-        and so on for every counter, and ``ene_source``, which says what was read or why not.
-        Where nothing could be read, ``ene_model_j`` and ``ene_model_frame_j`` by the stated model,
-        which ``energy_source`` names; never both.
-        Energy between the frames does not count.
+        Time: ``ext_ms`` (mean per frame, by the clock), ``ext_ms_median``, ``_p95``, ``_p99``,
+        ``_max``; ``cpu_ms_mean`` (processor time of all threads), ``cpu_ms_median``,
+        ``cpu_ms_p95``.
+
+        Memory: ``mem_peak_mb`` and ``mem_mb`` (peak, and mean over the frames, minus what was in
+        use when the meter was created), ``mem_process_mb`` (peak of the whole process).
+
+        Energy: ``ene_j`` (all frames together) and ``ene_frame_j`` (mean), both None if a device
+        was used without a counter; ``ene_cpu_j``, ``ene_gpu_j`` and so on for each counter; and
+        ``ene_source``, which names the counters or says why there are none. If no counter could be
+        read, ``ene_model_j`` and ``ene_model_frame_j`` come from the model that ``energy_source``
+        names; never both. Energy used between frames does not count.
 
         Args:
-            skip: leave so many first frames out of times and energy: buffers grow, kernels load.
+            skip: number of first frames to leave out of times and energy, while buffers grow and
+                kernels load.
 
         Raises:
             InputError: no frame is left.
@@ -200,7 +203,7 @@ class CostMeter:
         }
 
     def _estimate(self, counted: list[FrameCost]) -> dict[str, Any]:
-        """What the stated model says where nothing was measured."""
+        """Energy from the model, for when nothing was measured."""
         joules = self._core_watts * sum(cost.cpu_s for cost in counted)
         return {
             "ene_model_j": joules,

@@ -1,6 +1,6 @@
-"""Things that stand in rooms.
+"""Furniture and other objects in rooms.
 
-Each function builds one thing in the builder's current frame: z up from what it stands on (or
-from the point where it hangs), its back at y = 0, its front towards -y, x to the right of who
-looks at its front, centred.
+Each function builds one object in the builder's current frame: z up from the surface it stands on
+(or the point where it hangs), back at y = 0, front towards -y, and x to the right seen from the
+front, centred.
 """

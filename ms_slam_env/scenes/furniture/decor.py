@@ -15,7 +15,7 @@ from ms_slam_env.scenes.textures.pictures import picture
 
 
 def picture_frame(build: MeshBuilder, rng: Rng, width_m: float, height_m: float, name: str) -> None:
-    """Framed picture hanging with its middle at the origin."""
+    """Framed picture hanging with its centre at the origin."""
     size = (256, 384) if width_m > 1.25 * height_m else (256, 256)
     image = build.material(picture(rng, *size))
     kind = rng.random()
@@ -141,7 +141,7 @@ _PANELS_X_M, _PANELS_Z_M = (-0.34, 0.03), ((0.15, 0.85), (1.05, 1.9))
 def _panels_and_handle(
     build: MeshBuilder, paint: Material, metal: Material, is_mirrored: bool = False
 ) -> None:
-    """What one face of a leaf of 0.85 x 2.05 m has: panels, a handle at high x, or at low x."""
+    """One face of a leaf of 0.85 x 2.05 m: panels, a handle at high x (low x if mirrored)."""
     for low, high in _PANELS_Z_M:
         for x in _PANELS_X_M:
             build.box((x, -0.028, low), (x + 0.31, -0.012, high), paint, "Y")
@@ -162,7 +162,7 @@ def _casing(build: MeshBuilder, trim: Material, half_m: float = 0.425) -> None:
 
 
 def doorway(build: MeshBuilder, rng: Rng, name: str, width_m: float, wall_m: float) -> None:
-    """Lining, casings and threshold of a doorway, the middle of its wall at y = 0, x along it."""
+    """Lining, casings and threshold of a doorway; its wall is centred at y = 0, along x."""
     trim = build.plain((228, 224, 214))
     half, deep = width_m / 2, wall_m / 2
     with build.object(f"{name} casing"):
@@ -203,9 +203,10 @@ def open_leaf(
 
 
 def _stiles_and_rails() -> Iterator[tuple[float, float, float, float]]:
-    """Least x and z, width and height of what of a leaf lies beside its panels.
+    """Lower x and z, width and height of a leaf's parts beside its panels.
 
-    The light of a surface below a panel is that of the inside of a box, and would show beside it.
+    They must not extend beneath a panel: the baked light there is that of a box's inside, and would
+    spread to the visible part.
     """
     for x, end in ((-0.425, -0.34), (-0.03, 0.03), (0.34, 0.425)):
         yield x, 0.0, end - x, 2.05
@@ -222,7 +223,7 @@ def ceiling_lamp(build: MeshBuilder, width_m: float, depth_m: float, name: str) 
 
 
 def light_switch(build: MeshBuilder, name: str) -> None:
-    """Switch plate of 8 cm, middle at the origin."""
+    """Switch plate of 8 cm, centred at the origin."""
     white = build.plain((236, 234, 228))
     with build.object(name):
         build.box((-0.04, -0.008, -0.04), (0.04, 0, 0.04), white, "Y")

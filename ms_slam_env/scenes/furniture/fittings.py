@@ -25,7 +25,7 @@ def _hollow(
     material: Material,
     rim: float = 0.86,
 ) -> None:
-    """The top of a block with a rounded basin in it: from its border inwards and down.
+    """The top of a block with a rounded basin, from its border inwards and down.
 
     The block spans [low, high]; the basin reaches down to the height of ``low``.
     """
@@ -49,7 +49,7 @@ def _hollow(
 
 
 def _tap(build: MeshBuilder, z: float) -> None:
-    """Tap standing at the origin's (x, y), its spout towards -y."""
+    """Tap at the origin's (x, y), its spout towards -y."""
     metal = build.plain((188, 190, 192))
     build.lathe([(0.025, z), (0.025, z + 0.02), (0.013, z + 0.025), (0.013, z + 0.2)], metal, 12)
     build.box((-0.011, -0.17, z + 0.19), (0.011, 0.012, z + 0.212), metal)
@@ -181,7 +181,7 @@ def washbasin(build: MeshBuilder, rng: Rng, front: Material, name: str = "washba
 
 
 def mirror_cabinet(build: MeshBuilder, front: Material, name: str = "mirror cabinet") -> None:
-    """Cabinet on the wall, 0.6 x 0.65 m, its middle at the origin."""
+    """Cabinet on the wall, 0.6 x 0.65 m, centred at the origin."""
     metal = build.plain((176, 178, 180))
     with build.object(name):
         build.box((-0.3, -0.14, -0.325), (0.3, 0, 0.325), front, "Y")
@@ -223,7 +223,7 @@ def washing_machine(build: MeshBuilder, name: str = "washing machine") -> None:
 
 
 def radiator(build: MeshBuilder, width_m: float, name: str = "radiator") -> None:
-    """Ribbed radiator before the wall at y = 0, from 0.12 to 0.68 m above the floor."""
+    """Ribbed radiator in front of the wall at y = 0, from 0.12 to 0.68 m above the floor."""
     white = build.plain((232, 232, 226))
     half = width_m / 2
     with build.object(name):

@@ -17,7 +17,7 @@ BAY_M = 2.4
 
 @dataclass(frozen=True)
 class Stock:
-    """Materials of what a hall holds; things draw from these, so that many look alike."""
+    """Materials shared by the objects in a hall, so that many look alike."""
 
     boxes: tuple[Material, ...]
     crates: tuple[Material, ...]
@@ -88,7 +88,7 @@ def goods(build: MeshBuilder, rng: Rng, of: Stock, width: float, height: float, 
 
 
 def pallet_load(build: MeshBuilder, rng: Rng, of: Stock, width: float, height: float) -> None:
-    """A pallet from the origin with a crate, or rows of boxes, ``height`` at most."""
+    """A pallet from the origin with a crate or rows of boxes, at most ``height`` high."""
     deep = 0.9
     for y in (0.0, 0.4, 0.8):
         build.box((0, y, 0), (width, y + 0.1, 0.1), of.pallet, "z")
@@ -134,7 +134,7 @@ def machine(build: MeshBuilder, rng: Rng, of: Stock, name: str) -> None:
 
 
 def column(build: MeshBuilder, of: Stock, height_m: float, name: str) -> None:
-    """Steel column of H section on the origin, hazard stripes at its foot."""
+    """Steel H-section column at the origin, hazard stripes at its foot."""
     steel = build.plain((126, 134, 138))
     with build.object(name):
         for low, high in (
@@ -147,7 +147,7 @@ def column(build: MeshBuilder, of: Stock, height_m: float, name: str) -> None:
 
 
 def drum(build: MeshBuilder, rng: Rng, name: str) -> None:
-    """Steel drum on the origin."""
+    """Steel drum at the origin."""
     paint = hsv(rng.choice([0.0, 0.12, 0.36, 0.6]), 0.7, rng.uniform(0.35, 0.7))
     metal = build.material(industrial.corrugated(rng, paint, 3, 64), (0.9, 0.9))
     profile = [(0.29, 0.0)]

@@ -15,7 +15,7 @@ from ms_slam_env.scenes.textures.noise import Image, grain, hsv
 
 
 def upholstery(build: MeshBuilder, rng: Rng) -> Material:
-    """Woven fabric of a quiet colour."""
+    """Woven fabric of a muted colour."""
     colour = hsv(rng.random(), rng.uniform(0.08, 0.55), rng.uniform(0.3, 0.75))
     return build.material(fabric.weave(rng, colour), (0.25, 0.25))
 
@@ -96,7 +96,7 @@ def place(
     radii: list[float],
     tries: int = 60,
 ) -> list[tuple[float, float] | None]:
-    """Throw discs of the given radii into a rectangle without overlap; None where none fits."""
+    """Place discs at random in a rectangle without overlap; None for each that does not fit."""
     placed: list[tuple[float, float, float]] = []
     result: list[tuple[float, float] | None] = []
     for r in radii:

@@ -1,4 +1,4 @@
-"""Small things that stand on tables and shelves, and screens."""
+"""Small objects on tables and shelves, and screens."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def glaze(build: MeshBuilder, rng: Rng, banded: bool = True) -> Material:
 
 
 def wood(build: MeshBuilder, rng: Rng, tile_m: tuple[float, float], size: int = 512) -> Material:
-    """Board of some wood, one image of ``size`` pixels over ``tile_m``."""
+    """Wooden board, one image of ``size`` pixels over ``tile_m``."""
     return build.material(
         build.stocked(rng, f"board {size}", lambda: interior.board(rng, size=size)), tile_m
     )

@@ -1,1 +1,1 @@
-"""Dwellings of several rooms: floor plan, walls with doors and windows, furniture, light."""
+"""Homes of several rooms: floor plan, walls with doors and windows, furniture, light."""

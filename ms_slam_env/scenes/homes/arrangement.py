@@ -1,4 +1,4 @@
-"""Where furniture can stand in a room: along walls, clear of doors, windows and other things."""
+"""Furniture placement in a room: along walls, clear of doors, windows and other furniture."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from ms_slam_env.scenes.room import Opening, Room, Window
 from ms_slam_env.scenes.scene import Rng
 
 Box = tuple[float, float, float, float]
-"""Least x and y, greatest x and y of a footprint; or from where to where along and up a wall."""
+"""Lower x and y, upper x and y of a footprint; or ranges along and up a wall."""
 
 APPROACH_M = 0.8
-"""Floor before a doorway that stays free, on both sides."""
+"""Depth of floor kept free on both sides of a doorway."""
 _SWING_M = 0.95
 _BESIDE_DOOR_M = 0.14  # casing
 _BEYOND_HINGE_M = 0.3
 _CURTAIN_M = 0.45
-_LOW_M = 0.75  # what is lower fits under a window
-_STEP_M = 0.08  # between places tried along a wall
+_LOW_M = 0.75  # lower furniture fits under a window
+_STEP_M = 0.08  # between positions tried along a wall
 _CELL_M = 0.1
-_WALKER_M = 0.25  # half the width that stays free between furniture
+_WALKER_M = 0.25  # half the width kept free between furniture
 _APART_M = 0.03
 
 
 @dataclass(frozen=True)
 class LocalDoor:
-    """A door as one of its rooms sees it.
+    """A door, described from one of its rooms.
 
     Attributes:
-        wall: in which it is.
-        opening: where.
-        hinge: -1 or 1, the end along the wall where a leaf hangs opening into this room; 0: none.
+        wall: wall that it is in.
+        opening: its doorway in that wall.
+        hinge: -1 or 1, the end along the wall where a leaf opening into this room hangs; 0: none.
     """
 
     wall: int
@@ -48,7 +48,7 @@ class LocalDoor:
 
 @dataclass(frozen=True)
 class Spot:
-    """A place at a wall, ``gap`` metres before it."""
+    """A position at a wall, ``gap`` metres in front of it."""
 
     wall: int
     along: float
@@ -63,18 +63,18 @@ def overlap(a: Box, b: Box, apart: float = 0.0) -> bool:
 
 
 class Arrangement:
-    """What is taken of the floor and of the walls of a room.
+    """Occupied parts of a room's floor and walls.
 
     Attributes:
         room: the room.
-        doorsteps: floor that must stay free, before doors and under their leaves.
+        doorsteps: floor kept free, in front of doors and under their leaves.
         standing: footprints of furniture.
         curtains: floor under curtains, where nothing tall may stand.
-        on_walls: by wall, what is taken of it: from where to where, from which height to which.
+        on_walls: occupied ranges along and up each wall.
     """
 
     def __init__(self, room: Room, doors: Sequence[LocalDoor], windows: dict[int, Window]) -> None:
-        """An empty room."""
+        """Start with an empty room."""
         self.room = room
         self.doorsteps: list[Box] = []
         self.standing: list[Box] = []
@@ -105,17 +105,17 @@ class Arrangement:
         near: float | None = None,
         off: float = np.inf,
     ) -> Spot | None:
-        """Take a place at a wall for something of width, depth and height ``size``; None: no room.
+        """Reserve a position at a wall for an object of width, depth, height ``size``, or None.
 
         Args:
-            rng: draws the wall and the place.
+            rng: draws the wall and the position.
             size: metres.
-            walls: to choose from, the preferred first.
-            gap: to the wall.
-            before: floor that no other piece may take, in front of it.
+            walls: walls to choose from, preferred ones first.
+            gap: distance to the wall.
+            before: depth of floor in front of it to keep free.
             in_corner: try the ends of the walls first.
-            near: try this place along the wall first, and the next ones after it.
-            off: how far from it at most.
+            near: try this position along the wall first, then the nearest ones.
+            off: largest distance from ``near``.
         """
         width, depth, height = size
         for wall in walls:
@@ -146,9 +146,9 @@ class Arrangement:
         off: float = np.inf,
         depth: float = 0.0,
     ) -> Spot | None:
-        """Take a place on a wall for something of width and height ``size``, middle at ``z``.
+        """Reserve a position on a wall for an object of width and height ``size``, centre at ``z``.
 
-        What is ``depth`` thick hangs in the way of no door.
+        An object ``depth`` thick must not block a door.
         """
         width, height = size
         for wall in walls:
@@ -170,7 +170,7 @@ class Arrangement:
         high: Float64 | None = None,
         tries: int = 60,
     ) -> Float64 | None:
-        """Take floor of ``size`` (x, y) away from the walls; its middle (2,), None: no room."""
+        """Reserve floor of ``size`` (x, y) away from the walls; return its centre (2,) or None."""
         extent = np.array(size)
         least = extent / 2 + 0.05 if low is None else low
         most = np.array(self.room.size[:2]) - extent / 2 - 0.05 if high is None else high
@@ -183,7 +183,7 @@ class Arrangement:
         return None
 
     def take(self, middle: Float64, size: tuple[float, float]) -> bool:
-        """Take the floor of ``size`` around ``middle`` (2,) if it is free."""
+        """Reserve the floor of ``size`` around ``middle`` (2,) if it is free."""
         low, high = np.subtract(middle, np.divide(size, 2)), np.add(middle, np.divide(size, 2))
         box = (*low.tolist(), *high.tolist())
         inside = (low > 0).all() and (high < self.room.size[:2]).all()
@@ -193,18 +193,18 @@ class Arrangement:
         return True
 
     def is_floor_free(self, wall: int, low: float, high: float, depth: float) -> bool:
-        """Whether nothing stands before a stretch of a wall and no door opens there."""
+        """Whether nothing stands in front of a section of a wall and no door opens there."""
         return self._is_free(self._footprint(wall, low, high, 0.0, depth))
 
     def is_clear_of_doors(self, wall: int, low: float, high: float, depth: float) -> bool:
-        """Whether no door opens, and none is gone through, before a stretch of a wall."""
+        """Whether a section of a wall is clear of doors and of the way through them."""
         box = self._footprint(wall, low, high, 0.0, depth)
         return not any(overlap(box, doorstep) for doorstep in self.doorsteps)
 
     def _alongs(
         self, rng: Rng, wall: int, width: float, in_corner: bool, near: float | None, off: float
     ) -> Iterator[float]:
-        """Places along a wall for something so wide, the better ones first."""
+        """Positions along a wall for an object of ``width``, better ones first."""
         slack = self.room.length(wall) / 2 - width / 2 - 0.02
         if slack < 0:
             return
@@ -218,7 +218,7 @@ class Arrangement:
         yield from places.tolist()
 
     def _footprint(self, wall: int, low: float, high: float, near: float, far: float) -> Box:
-        """Box on the floor that lies between two places along a wall, between two distances."""
+        """Floor box between two positions along a wall and two distances from it."""
         corners = [
             self.room.to_world(wall, (a, -d, 0))[:2] for a, d in product((low, high), (near, far))
         ]
@@ -230,7 +230,7 @@ class Arrangement:
         )
 
     def _walkable_with(self, box: Box) -> bool:
-        """Whether one still gets from each door to all others, and to most of the free floor."""
+        """Whether each door, and most of the free floor, can still be reached from all doors."""
         w, d, _ = self.room.size
         x, y = (
             np.arange(_WALKER_M, w - _WALKER_M, _CELL_M),
@@ -256,18 +256,18 @@ class Arrangement:
 
 @dataclass
 class Furnisher:
-    """Puts things into one room; every coordinate is the room's own.
+    """Furnishes one room, in the room's coordinates.
 
     Attributes:
-        build: takes the things.
+        build: receives the furniture.
         rng: draws all choices.
-        name: of the room.
-        kind: of the room.
-        windows: by wall.
-        arrangement: of the room.
-        bulbs: places (3,) of bulbs that shine.
-        doors: of the room.
-        has_kitchen: whether a kitchen is part of it, the dwelling having no other.
+        name: name of the room.
+        kind: kind of the room.
+        windows: windows by wall.
+        arrangement: occupied floor and walls.
+        bulbs: positions (3,) of lit bulbs.
+        doors: doors of the room.
+        has_kitchen: whether it includes a kitchen, because the home has no other.
     """
 
     build: MeshBuilder
@@ -282,7 +282,7 @@ class Furnisher:
 
     @property
     def room(self) -> Room:
-        """Its size."""
+        """The room."""
         return self.arrangement.room
 
     def walls(self) -> list[int]:
@@ -291,6 +291,6 @@ class Furnisher:
 
     @contextmanager
     def at(self, spot: Spot, z: float = 0.0) -> Iterator[None]:
-        """Add things in the frame of a spot at a wall."""
+        """Add objects in the frame of a spot at a wall."""
         with self.room.at_wall(self.build, spot.wall, spot.along, z, spot.gap):
             yield

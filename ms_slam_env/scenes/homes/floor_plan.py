@@ -1,4 +1,4 @@
-"""Floor plans of dwellings: rooms along a hall, the doors between them, windows to the outside."""
+"""Floor plans of homes: rooms along a hall, doors between them, windows to the outside."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DOOR_HEIGHT_M = 2.05
 ROOMS_M = (3, 7)
 """Fewest and most rooms besides the hall."""
 AREA_M2 = (40.0, 120.0)
-"""Smallest and largest floor, walls left out."""
+"""Smallest and largest floor area, without walls."""
 
 HALL = "hall"
 _AREA_M2 = {
@@ -29,13 +29,13 @@ _AREA_M2 = {
     "nursery": (9.5, 13.0),
 }
 KINDS = (*_AREA_M2, HALL)
-"""What rooms there are; a second bedroom is called ``bedroom2``."""
+"""Kinds of rooms; a second bedroom is called ``bedroom2``."""
 
 _OF_SMALL_HOMES = ("living", "bedroom", "bathroom", "kitchen")
 _FURTHER = ("study", "nursery", "bedroom2")
-_LEAST_M = {"bathroom": 1.9, "kitchen": 2.3, "study": 2.3}  # 2.6 the others
+_LEAST_M = {"bathroom": 1.9, "kitchen": 2.3, "study": 2.3}  # 2.6 for the others
 _HALL_M = (1.55, 1.85)
-_LAYOUTS = 60  # tried, the best one taken
+_LAYOUTS = 60  # tried; the best is used
 _CASING_M = 0.1
 _CORNER_M = 0.2  # between a casing and the corner of the room
 DOOR_M = 0.9
@@ -48,13 +48,14 @@ class Doorway:
     """An opening in the wall between two rooms, or a closed door to the outside.
 
     Attributes:
-        middle: (x, y) of its floor, in the middle of the wall; at the wall's face of the entrance.
-        along_x: whether one walks through it along x.
-        rooms: indices of the rooms on its low and high side; the entrance has one room.
+        middle: (x, y) of its floor's centre, in the middle of the wall; for the entrance, at the
+            wall's face.
+        along_x: whether the way through it is along x.
+        rooms: indices of the rooms on its low and high side; the entrance has only one.
         width: metres.
         leaf: angle in radians by which the leaf is open into room ``rooms[into]``; None: no leaf.
-        into: 0 or 1.
-        hinge: -1 or 1: the end, along the wall, where the leaf hangs.
+        into: 0 or 1, index into ``rooms`` of the room that the leaf opens into.
+        hinge: -1 or 1: the end along the wall where the leaf hangs.
     """
 
     middle: tuple[float, float]
@@ -67,11 +68,11 @@ class Doorway:
 
     @property
     def is_entrance(self) -> bool:
-        """Whether it leads out of the dwelling, and is closed."""
+        """Whether it is the home's closed outer door."""
         return len(self.rooms) == 1
 
     def side(self, room: int) -> float:
-        """+1 where ``room`` lies on its high side, -1 where on its low side."""
+        """+1 if ``room`` is on its high side, -1 if on its low side."""
         return 1.0 if self.rooms.index(room) == 1 else -1.0
 
 
@@ -80,11 +81,11 @@ class RoomPlan:
     """A room.
 
     Attributes:
-        name: unique in the dwelling.
-        kind: of ``KINDS``.
-        low: least corner (x, y) of its floor, metres.
-        high: greatest corner.
-        windows: by wall, as ``Room`` counts them.
+        name: unique name in the home.
+        kind: one of ``KINDS``.
+        low: lower corner (x, y) of its floor, metres.
+        high: upper corner.
+        windows: windows by wall, numbered as in ``Room``.
     """
 
     name: str
@@ -100,13 +101,13 @@ class RoomPlan:
 
     @property
     def area(self) -> float:
-        """Of the floor, square metres."""
+        """Floor area, square metres."""
         return float(np.prod(self.size))
 
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """Rooms, the hall the last of them, and the doors between them."""
+    """Rooms, the hall last, and the doors between them."""
 
     rooms: tuple[RoomPlan, ...]
     doors: tuple[Doorway, ...]
@@ -114,7 +115,7 @@ class FloorPlan:
 
     @property
     def area(self) -> float:
-        """Of all floors, square metres."""
+        """Total floor area, square metres."""
         return sum(room.area for room in self.rooms)
 
     def doors_of(self, room: int) -> list[Doorway]:
@@ -122,7 +123,7 @@ class FloorPlan:
         return [door for door in self.doors if room in door.rooms]
 
     def wall_of(self, door: Doorway, room: int) -> tuple[int, float]:
-        """In which wall of ``room`` a door is, and how far along it, as ``Room`` counts."""
+        """The wall of ``room`` that a door is in, and its position along it, as in ``Room``."""
         own = self.rooms[room]
         box = Room((*own.size, self.height))
         middle = np.array(door.middle) - own.low
@@ -134,10 +135,10 @@ class FloorPlan:
 
 
 def draw_plan(rng: Rng) -> FloorPlan:
-    """Draw a dwelling of 3 to 7 rooms and a hall.
+    """Draw a home of 3 to 7 rooms and a hall.
 
-    The rooms lie in one or two rows along the hall, as wide as their areas ask; the living room may
-    lie across the end of hall and rows instead.
+    The rooms form one or two rows along the hall, with widths according to their areas; the living
+    room may instead span the end of hall and rows.
     """
     count = int(rng.integers(ROOMS_M[0], ROOMS_M[1] + 1))
     kinds = [*_OF_SMALL_HOMES[:count], *rng.permutation(_FURTHER)[: max(0, count - 4)].tolist()]
@@ -149,7 +150,7 @@ def draw_plan(rng: Rng) -> FloorPlan:
 
 
 def _layout(rng: Rng, kinds: Sequence[str]) -> tuple[RoomPlan, ...]:
-    """Some arrangement of the rooms, good or bad, the hall along x."""
+    """Draw an arrangement of the rooms, good or bad, with the hall along x."""
     area = {kind: rng.uniform(*_AREA_M2[_kind(kind)]) for kind in kinds}
     if len(kinds) == 3:
         area["living"] += rng.uniform(4.0, 9.0)  # the kitchen is in it
@@ -163,7 +164,7 @@ def _layout(rng: Rng, kinds: Sequence[str]) -> tuple[RoomPlan, ...]:
     areas = [sum(area[kind] for kind in row) for row in (lower, upper)]
     length = sum(areas) / rng.uniform(4.5, 8.5)
     depths = [of_row / length for of_row in areas]
-    y = (0.0, depths[0] + WALL_M, depths[0] + hall + 2 * WALL_M)  # of lower row, hall, upper row
+    y = (0.0, depths[0] + WALL_M, depths[0] + hall + 2 * WALL_M)  # lower row, hall, upper row
     rooms: list[RoomPlan] = []
     for row, low, depth in ((lower, y[0], depths[0]), (upper, y[2], depths[1])):
         walls = WALL_M * (len(row) - 1)
@@ -185,7 +186,7 @@ def _kind(name: str) -> str:
 
 
 def _awkwardness(rooms: Sequence[RoomPlan]) -> float:
-    """How far rooms are from square, and very much for one that is too narrow."""
+    """Penalty for rooms that are not square, and a large one for rooms that are too narrow."""
     total = 0.0
     for room in rooms[:-1]:
         short, long = np.sort(room.size)
@@ -197,7 +198,7 @@ def _awkwardness(rooms: Sequence[RoomPlan]) -> float:
 
 
 def _turned(rng: Rng, rooms: Sequence[RoomPlan]) -> tuple[RoomPlan, ...]:
-    """The dwelling mirrored or not along x and y, its hall along x or y."""
+    """Randomly mirror the home in x and y, and choose the hall's direction, x or y."""
     far = np.max([room.high for room in rooms], axis=0)
     mirrored, swapped = rng.random(2) < 0.5, rng.random() < 0.5
 
@@ -212,7 +213,7 @@ def _turned(rng: Rng, rooms: Sequence[RoomPlan]) -> tuple[RoomPlan, ...]:
 
 
 def _with_windows(rng: Rng, rooms: Sequence[RoomPlan], index: int) -> RoomPlan:
-    """A room with a window in its longest outer wall, and in the next one where it is large."""
+    """Add a window to a room's longest outer wall, and to the next one if the room is large."""
     room = rooms[index]
     if room.kind == HALL:
         return room
@@ -234,7 +235,7 @@ def _with_windows(rng: Rng, rooms: Sequence[RoomPlan], index: int) -> RoomPlan:
 
 
 def _outer_walls(rooms: Sequence[RoomPlan], index: int) -> list[int]:
-    """Those walls of a room behind which there is no other room, as ``Room`` counts them."""
+    """Walls of a room with no room behind them, numbered as in ``Room``."""
     low = np.min([one.low for one in rooms], axis=0)
     high = np.max([one.high for one in rooms], axis=0)
     to_high = np.isclose(rooms[index].high, high)
@@ -244,7 +245,7 @@ def _outer_walls(rooms: Sequence[RoomPlan], index: int) -> list[int]:
 
 
 def _doors(rng: Rng, rooms: Sequence[RoomPlan]) -> tuple[Doorway, ...]:
-    """A door from the hall to every room, an opening from kitchen to living room, the entrance."""
+    """Doors from the hall to every room, an opening from kitchen to living room, the entrance."""
     hall = len(rooms) - 1
     doors = []
     for index in range(hall):
@@ -264,12 +265,12 @@ def _doors(rng: Rng, rooms: Sequence[RoomPlan]) -> tuple[Doorway, ...]:
 
 @dataclass(frozen=True)
 class _SharedWall:
-    """Where two rooms face each other: from ``low`` to ``high`` (2,), the middle of the wall."""
+    """The wall shared by two rooms: the middle of the wall from ``low`` to ``high`` (2,)."""
 
     low: Float64
     high: Float64
     along_x: bool  # the way through it
-    is_swapped: bool  # the first room lies on the high side
+    is_swapped: bool  # the first room is on the high side
 
     @property
     def length(self) -> float:
@@ -280,7 +281,7 @@ def _shared_wall(rooms: Sequence[RoomPlan], a: int, b: int) -> _SharedWall | Non
     one, other = rooms[a], rooms[b]
     low, high = np.maximum(one.low, other.low), np.minimum(one.high, other.high)
     for axis in (0, 1):
-        # Across the wall the later beginning lies one wall's thickness after the earlier end.
+        # Across the wall, one room starts a wall's thickness after the other ends.
         if abs(low[axis] - high[axis] - WALL_M) < 1e-6 and high[1 - axis] - low[1 - axis] > 1.2:
             middle = (low[axis] + high[axis]) / 2
             low[axis] = high[axis] = middle
@@ -289,7 +290,7 @@ def _shared_wall(rooms: Sequence[RoomPlan], a: int, b: int) -> _SharedWall | Non
 
 
 def _door(rng: Rng, wall: _SharedWall, rooms: tuple[int, int], is_wide: bool = False) -> Doorway:
-    """A door near an end of a shared wall, or a wide opening in its middle."""
+    """Add a door near an end of a shared wall, or a wide opening at its centre."""
     margin = _CASING_M + _CORNER_M
     if is_wide:
         width = min(rng.uniform(*_WIDE_M), wall.length - 2 * margin)
@@ -304,7 +305,7 @@ def _door(rng: Rng, wall: _SharedWall, rooms: tuple[int, int], is_wide: bool = F
     leaf = None
     if not is_wide and rng.random() < 0.85:
         leaf = float(np.radians(rng.uniform(80.0, 105.0)))
-    # The leaf turns into the room, not into the hall, and against the nearer corner.
+    # The leaf opens into the room, not into the hall, towards the nearer corner.
     hinge = -1 if share < 0.5 else 1
     return Doorway(
         tuple(middle.tolist()),
@@ -318,7 +319,7 @@ def _door(rng: Rng, wall: _SharedWall, rooms: tuple[int, int], is_wide: bool = F
 
 
 def _entrance(rng: Rng, rooms: Sequence[RoomPlan], hall: int) -> Doorway:
-    """A closed door at an end of the hall that lies on the outside."""
+    """Add a closed door at an end of the hall that is an outer wall."""
     own = rooms[hall]
     along_x = own.size[0] > own.size[1]
     ends = [wall for wall in _outer_walls(rooms, hall) if (wall % 2 == 1) == along_x]

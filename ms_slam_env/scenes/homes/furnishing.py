@@ -1,4 +1,4 @@
-"""What stands and hangs in each kind of room."""
+"""Furniture of each kind of room."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def furnish(of: Furnisher) -> None:
 
 
 def _living(of: Furnisher) -> None:
-    """Sofa and table before it, television, shelves, armchair, lamp; a kitchen if there is none."""
+    """Sofa with a table, television, shelves, armchair, lamp; a kitchen if there is no other."""
     rng, build = of.rng, of.build
     if of.has_kitchen:
         _kitchen_line(of, 2.4)
@@ -119,7 +119,7 @@ def _bathroom(of: Furnisher) -> None:
 
 
 def _hall(of: Furnisher) -> None:
-    """Coats, chests of drawers, narrow shelves and rugs, one for every few metres."""
+    """Coats, chests of drawers, narrow shelves and rugs, one every few metres."""
     build, rng = of.build, of.rng
     rack = of.arrangement.hang(rng, (1.0, 1.1), 1.3, of.walls(), depth=0.2)
     if rack is not None:
@@ -157,7 +157,7 @@ def _put(
     gap: float = 0.02,
     before: float = 0.35,
 ) -> Spot | None:
-    """Stand something at any wall, if there is room."""
+    """Place an object at any wall, if there is room."""
     spot = of.arrangement.stand(of.rng, size, of.walls(), gap, before)
     if spot is not None:
         with of.at(spot):
@@ -173,7 +173,7 @@ def _inner_first(of: Furnisher) -> list[int]:
 def _shine(
     of: Furnisher, spot: Spot, at: tuple[float, float, float], draw: Callable[[], float]
 ) -> None:
-    """Add a lamp at a place of a spot's frame, and its bulb to those of the room."""
+    """Add a lamp in a spot's frame, and its bulb to those of the room."""
     with of.at(spot), of.build.frame(at):
         height = draw()
     x, y, z = at
@@ -181,7 +181,7 @@ def _shine(
 
 
 def _rug_before(of: Furnisher, spot: Spot, away: float, width: float, depth: float) -> None:
-    """A rug whose middle lies so far from a spot's wall, no wider than the room is there."""
+    """A rug with its centre ``away`` metres from a spot's wall, no wider than the room there."""
     room = of.room
     half = room.length(spot.wall) / 2
     low, high = max(-half + 0.1, spot.along - width / 2), min(half - 0.1, spot.along + width / 2)
@@ -218,7 +218,7 @@ def _scatter(
     z: float,
     things: Sequence[tuple[float, Callable[[], object]]],
 ) -> None:
-    """Put things of given radii on a rectangle at height ``z``, without overlap."""
+    """Place objects of given radii on a rectangle at height ``z``, without overlap."""
     spots = pieces.place(of.rng, low, high, [radius for radius, _ in things])
     for spot, (_, draw) in zip(spots, things, strict=True):
         if spot is not None:
@@ -301,7 +301,7 @@ def _laid(of: Furnisher, width: float, depth: float) -> None:
 
 
 def _kitchen_line(of: Furnisher, width: float) -> None:
-    """Counter with cupboards over it where no window is, and the refrigerator near."""
+    """Counter, with cupboards above if there is no window, and the refrigerator nearby."""
     build, rng = of.build, of.rng
     front = build.plain(hsv(rng.choice([0.1, 0.3, 0.55, 0.0]), rng.uniform(0.02, 0.3), 0.88))
     if rng.random() < 0.5:
@@ -436,7 +436,7 @@ def _hang_shelf(of: Furnisher) -> None:
 
 
 def _decorate(of: Furnisher) -> None:
-    """Pictures on the free stretches of the walls, a shelf."""
+    """Pictures on the free sections of the walls, a shelf."""
     build, rng = of.build, of.rng
     if of.kind in ("living", "study", "nursery", "bedroom"):
         _hang_shelf(of)
@@ -451,7 +451,7 @@ def _decorate(of: Furnisher) -> None:
 
 
 def _at_windows(of: Furnisher) -> None:
-    """Curtains or none, a plant on the sill, a radiator where nothing stands."""
+    """Optional curtains, a plant on the sill, a radiator if nothing stands there."""
     build, rng = of.build, of.rng
     for wall, window in of.windows.items():
         wide = max(0.6, round(0.7 * window.width / 0.06) * 0.06)
@@ -469,7 +469,7 @@ def _at_windows(of: Furnisher) -> None:
 
 
 def _curtains(of: Furnisher, wall: int) -> None:
-    """Curtains on both sides of a window, to the floor where nothing stands there."""
+    """Curtains on both sides of a window, down to the floor if nothing stands there."""
     build, rng, window = of.build, of.rng, of.windows[wall]
     cloth = decor.curtain_cloth(rng)
     top = window.sill + window.height + 0.15

@@ -1,4 +1,4 @@
-"""A dwelling of several rooms as a scene, kept on disk once it is built and lit."""
+"""A home of several rooms as a scene, cached on disk once built and lit."""
 
 from __future__ import annotations
 
@@ -40,29 +40,29 @@ from ms_slam_env.scenes.scene import Rng, TexturedMesh
 _KEY = 0.18
 _VARIETY = 5
 _EYE_M = 1.3
-_START_OBJECTS = 5  # a wall, its skirting and the floor are three
+_START_OBJECTS = 5  # a wall, its skirting board and the floor are three
 _MOST_POINTS = 3_000_000
 _OF_MESH = ("vertices", "faces", "uv", "face_texture", "face_label", "irradiance")
 _TEXTURE = "texture "
 
 
 def home(seed: int) -> HomeScene:
-    """Build the dwelling of ``seed``: 3 to 7 rooms and a hall, 40 to 120 m2; slow the first time.
+    """Build the home of ``seed``: 3 to 7 rooms and a hall, 40 to 120 m2; slow the first time.
 
-    Places: the names of the rooms, as "hall", "living", "kitchen", "bedroom2".
+    Places: the names of the rooms, such as "hall", "living", "kitchen", "bedroom2".
 
-    One has much to see: 338 m2 in the smallest of the first three test seeds (57 m2 of floor). With
-    motions of 12 cm and 12 degrees, views chosen by someone who knows it all show 75 % of that in
-    600 steps and 85 % in 966; with 25 cm and 20 degrees 85 % in 611, which SLAM does not survive at
-    one frame a step. An episode that is to see most of a home needs more steps than 600, or several
-    frames a step.
+    A home has much surface: 338 m2 in the smallest of the first three test seeds (57 m2 of floor).
+    With motions of 12 cm and 12 degrees, views chosen with full knowledge of the home show 75 % of
+    it in 600 steps and 85 % in 966. With 25 cm and 20 degrees they show 85 % in 611, but SLAM does
+    not survive that at one frame per step. To see most of a home, an episode needs more than 600
+    steps, or several frames per step.
     """
     name = mesh_cache.key([], (home.__name__, version(), seed))
     return scene_from(seed, mesh_cache.remembered(name, lambda: worked_out(seed)))
 
 
 def scene_from(seed: int, arrays: mesh_cache.Arrays) -> HomeScene:
-    """The scene of ``seed`` from what is kept of it."""
+    """Make the scene of ``seed`` from its cached arrays."""
     textures = tuple(arrays[name] for name in arrays if name.startswith(_TEXTURE))
     mesh = TexturedMesh(
         **{field: arrays[field] for field in _OF_MESH},
@@ -75,14 +75,14 @@ def scene_from(seed: int, arrays: mesh_cache.Arrays) -> HomeScene:
 
 
 def built(seed: int) -> tuple[FloorPlan, MeshBuilder, list[Furnisher], Rng]:
-    """The dwelling of ``seed`` without its light; the generator that goes on to draw that."""
+    """Build the home of ``seed`` without light; return the generator that then draws the light."""
     plan, rng = _plan(seed)
     build = MeshBuilder(variety=_VARIETY)
     return plan, build, furnished(build, rng, plan), rng
 
 
 def worked_out(seed: int) -> mesh_cache.Arrays:
-    """What is kept of a dwelling: the lit mesh, its free space, its exposure, what can be seen."""
+    """Compute a home's cached data: the lit mesh, free space, exposure and visible faces."""
     plan, build, rooms, rng = built(seed)
     eyes = np.array([[*np.add(room.low, room.high) / 2, _EYE_M] for room in plan.rooms])
     mesh, exposure = light_and_expose(build, home_lighting(rng, plan, rooms), eyes, _KEY)
@@ -98,7 +98,7 @@ def worked_out(seed: int) -> mesh_cache.Arrays:
 
 @lru_cache(maxsize=1)
 def version() -> str:
-    """A hash of all code that dwellings are made by, and of the versions of what it calls."""
+    """A hash of all code that makes homes, and of the versions of its dependencies."""
     digest = hashlib.sha256(repr((np.__version__, scipy.__version__, cv2.__version__)).encode())
     for file in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(file.read_bytes())
@@ -111,7 +111,7 @@ def _plan(seed: int) -> tuple[FloorPlan, Rng]:
 
 
 class HomeScene(MeshScene):
-    """A dwelling: its surface is what a camera that passes through its doors can see."""
+    """A home; its surface is what a camera moving through its doors can see."""
 
     passage_m = DOOR_M
 
@@ -124,7 +124,7 @@ class HomeScene(MeshScene):
         exposure: float,
         seen: NDArray[np.bool_],
     ) -> None:
-        """Put the parts together; ``seen`` (F,) are the faces that a camera can see."""
+        """Assemble the scene; ``seen`` (F,) marks the faces that a camera can see."""
         self.plan = plan
         self._seen = np.flatnonzero(seen).astype(np.int32)
         super().__init__(home, seed, mesh, free_space, self._start, exposure, _START_OBJECTS)
@@ -137,7 +137,7 @@ class HomeScene(MeshScene):
 
     @cached_property
     def places(self) -> dict[str, Float64]:
-        """By the name of a room, the point (3,) on its floor with the most free space around."""
+        """The point (3,) with the most free space on each room's floor, by room name."""
         points, room_there = self._ways.widest
         found = {}
         for room in self.plan.rooms:
@@ -150,7 +150,7 @@ class HomeScene(MeshScene):
         """See the base class.
 
         Raises:
-            InputError: there is none, which is where one of the two is not free.
+            InputError: there is none, because an end is not free.
         """
         found = self._ways.between(start, end)
         if found is None:
@@ -158,9 +158,9 @@ class HomeScene(MeshScene):
         return np.concatenate([found, np.zeros((len(found), 1))], axis=1)
 
     def surface_points(self, spacing_m: float = 0.01) -> tuple[Float64, Int32]:
-        """See the base class: what shows itself to some place that a camera can reach.
+        """See the base class; only surface visible from where a camera can get.
 
-        There are ``_MOST_POINTS`` at most, farther apart if they must be.
+        At most ``_MOST_POINTS`` points, spaced wider if necessary.
         """
         return self._open_points(self._seen, spacing_m, _MOST_POINTS)
 
@@ -177,13 +177,13 @@ class HomeScene(MeshScene):
 _SKY = np.array([0.95, 1.0, 1.08]) * 6.0
 _WARM = np.array([1.0, 0.9, 0.75])
 _BULB = np.array([1.0, 0.78, 0.5])
-_LEVEL = (0.09, 0.13)  # flux of all light of a room over the area of its surfaces
-_LEAST_LAMP = 0.015  # of the lamp under the ceiling, in the same units
-_REVEAL_M = 0.14  # the light of a window comes from behind its reveal
+_LEVEL = (0.09, 0.13)  # total light flux of a room over its surface area
+_LEAST_LAMP = 0.015  # least flux of the ceiling lamp, in the same units
+_REVEAL_M = 0.14  # a window's light comes from behind its reveal
 
 
 def home_lighting(rng: Rng, plan: FloorPlan, rooms: Sequence[Furnisher]) -> Lighting:
-    """Daylight of one brightness for all windows, and lamps that make up for it room by room."""
+    """Equal daylight for all windows, and lamps that complement it in each room."""
     day = rng.uniform(0.4, 1.0)
     sky = _SKY * day
     angle = rng.uniform(0, 2 * np.pi)
@@ -227,7 +227,7 @@ def home_lighting(rng: Rng, plan: FloorPlan, rooms: Sequence[Furnisher]) -> Ligh
 
 
 def _window_light(own: RoomPlan, room: Room, wall: int, window: Window, sky: Float64) -> Panel:
-    """The light of the sky through a window, in the dwelling's frame."""
+    """Skylight through a window, in the home's frame."""
     half = window.width / 2
     right, left = (
         room.to_world(wall, (window.along + side * half, _REVEAL_M, window.sill))
@@ -239,26 +239,26 @@ def _window_light(own: RoomPlan, room: Room, wall: int, window: Window, sky: Flo
 
 
 CAMERA_M = 0.15
-"""Free space around a camera that goes about."""
+"""Free space around a moving camera."""
 _SPACING_M = 0.4  # between viewpoints
-_HEIGHTS_M = (0.4, 1.1, 1.8)  # not from the floor up under tables
+_HEIGHTS_M = (0.4, 1.1, 1.8)  # of viewpoints; none from the floor up under tables
 _LOOKS = ((6, 1), (240, 5), (700, 7))
-"""Each face is looked at from so many nearest viewpoints, or every so many of these; what the
-first few do not see from the others, which lie on more sides."""
+"""Rounds of (number of nearest viewpoints, stride) in which a face is tested. Faces not visible in
+a round are tested in the next, from viewpoints on more sides."""
 _HIT = 0.99
 _LEAST_COSINE = 0.15
-"""Of the angle of incidence: what is seen more obliquely gives a depth camera no reading."""
+"""Least cosine of the angle of incidence; a depth camera has no reading at more oblique angles."""
 
 
 def reachable_cells(free: FreeSpace, start: Float64, radius_m: float = CAMERA_M) -> Bool:
-    """Voxels (nx, ny, nz) that a ball of ``radius_m`` can get to from ``start`` (3,)."""
+    """Voxels (nx, ny, nz) that a ball of ``radius_m`` can reach from ``start`` (3,)."""
     component, _ = ndimage.label(free.distance > radius_m)
     at = component[tuple(np.rint((start - free.origin) / free.voxel_m).astype(int))]
     return (component == at) & (at > 0)
 
 
 def viewpoints(free: FreeSpace, start: Float64) -> Float64:
-    """Places (K, 3) in a grid over all of the free space that a camera can reach."""
+    """Viewpoints (K, 3) on a grid over all free space that a camera can reach."""
     step = max(1, round(_SPACING_M / free.voxel_m))
     cells = reachable_cells(free, start)
     heights = np.rint((np.array(_HEIGHTS_M) - free.origin[2]) / free.voxel_m).astype(int)
@@ -268,9 +268,9 @@ def viewpoints(free: FreeSpace, start: Float64) -> Float64:
 
 
 def seen_faces(mesh: TexturedMesh, free: FreeSpace, start: Float64) -> Bool:
-    """Which faces (F,) show the middle of their front, which opens into free space, to a viewpoint.
+    """Which faces (F,) open into free space and show their centre to a viewpoint.
 
-    A few in a hundred that only few places see are missed.
+    Misses a few per cent of the faces, which are visible from few viewpoints only.
     """
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     middle, normal = corners.mean(axis=1), unit_rows(face_cross(corners))

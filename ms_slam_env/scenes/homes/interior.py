@@ -1,4 +1,4 @@
-"""The rooms of a floor plan built: floors, walls, doors, and what furnishing puts into them."""
+"""Builds the rooms of a floor plan: floors, walls, doors and furniture."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from ms_slam_env.scenes.scene import Rng
 from ms_slam_env.scenes.textures import fabric, interior
 from ms_slam_env.scenes.textures.noise import hsv
 
-_SHELL_CELL_M = 0.22  # which puts corners between the panels of doors, not under them
+_SHELL_CELL_M = 0.22  # so that vertices lie between door panels, not under them
 _TILED = ("kitchen", "bathroom")
 _SOFT = ("bedroom", "nursery")  # may have a carpet
-_SPECIAL = ("living", "bedroom", "nursery", "study")  # one wall papered or of brick
+_SPECIAL = ("living", "bedroom", "nursery", "study")  # have one wall of wallpaper or brick
 
 
 def furnished(build: MeshBuilder, rng: Rng, plan: FloorPlan) -> list[Furnisher]:
-    """Build the rooms of a plan and what is in them; what each of them holds."""
+    """Build the rooms of a plan with their furniture; return each room's furnisher."""
     floors = _Floors(build, rng)
     paint = np.array([225, 220, 208]) * rng.uniform(0.6, 1.0)
     rooms = [_furnished_room(build, rng, plan, index, floors) for index in range(len(plan.rooms))]
@@ -40,7 +40,7 @@ def furnished(build: MeshBuilder, rng: Rng, plan: FloorPlan) -> list[Furnisher]:
 
 
 class _Floors:
-    """Floors, skirting and ceiling that rooms share."""
+    """Floors, skirting boards and ceiling shared by rooms."""
 
     def __init__(self, build: MeshBuilder, rng: Rng) -> None:
         self.wood = floor_material(build, rng)
@@ -50,7 +50,7 @@ class _Floors:
         self.skirting = build.plain((232, 228, 218))
 
     def of(self, build: MeshBuilder, rng: Rng, kind: str) -> Material:
-        """The floor of a kind of room."""
+        """Floor material for a kind of room."""
         if kind in _TILED:
             return self.tiles
         if kind in _SOFT and rng.random() < 0.4:
@@ -62,7 +62,7 @@ class _Floors:
 def _walls(
     build: MeshBuilder, rng: Rng, kind: str
 ) -> tuple[Material, Material, Material, Material]:
-    """Four materials, by the kind of the room."""
+    """Materials of the four walls, by kind of room."""
     colour = wall_colour(rng)
     if kind == "bathroom":
         tone = hsv(
@@ -113,25 +113,25 @@ def _furnished_room(
 
 
 def lamp_size(room: RoomPlan) -> tuple[float, float]:
-    """Width and depth of its ceiling lamp, metres: a long one in a long room."""
+    """Width and depth of a room's ceiling lamp, metres; a long lamp in a long room."""
     if room.kind == HALL:
         return (1.4, 0.3) if room.size[0] > room.size[1] else (0.3, 1.4)
     return 0.5, 0.5
 
 
 def _local(plan: FloorPlan, door: Doorway, index: int) -> LocalDoor:
-    """A door as a room sees it."""
+    """Describe a door from one of its rooms."""
     wall, along = plan.wall_of(door, index)
     hinge = 0
     if door.leaf is not None and door.rooms[door.into] == index:
-        hinge = door.hinge if wall in (0, 3) else -door.hinge  # whose x has the world's sign
+        hinge = door.hinge if wall in (0, 3) else -door.hinge  # their x has the world's sign
     return LocalDoor(wall, Opening(along, door.width, DOOR_HEIGHT_M), hinge)
 
 
 def _door(
     build: MeshBuilder, rng: Rng, plan: FloorPlan, door: Doorway, name: str, paint: Float64
 ) -> None:
-    """Casing, threshold and leaf of a doorway; the closed door of the entrance."""
+    """Add casing, threshold and leaf of a doorway, or the closed entrance door."""
     index = door.rooms[door.into]
     own = plan.rooms[index]
     local = _local(plan, door, index)

@@ -1,4 +1,4 @@
-"""Ways for a walker through a dwelling: the shortest that keep off walls and furniture."""
+"""Walking routes through a home: the shortest that keep clear of walls and furniture."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from ms_slam_env.scenes.free_space import FreeSpace
 _CELL_M = 0.1
 _COLUMN_M = (1.0, 1.75)  # heights that must be free
 _LEAST_M = 0.28  # free space around the walker
-_NEAR_M = 0.3  # from the ends of a way to its first and last cell
-_EASY_M = 0.6  # more than this is no better
+_NEAR_M = 0.3  # from the ends of a route to its first and last cell
+_EASY_M = 0.6  # a larger clearance is no better
 _STEPS = ((1, 0), (0, 1), (1, 1), (1, -1))
 
 
 class Ways:
-    """Shortest ways on a grid of the floor; cells near an obstacle count for more."""
+    """Shortest routes on a floor grid; cells near an obstacle cost more."""
 
     def __init__(self, free: FreeSpace, low: Float64, high: Float64) -> None:
-        """Cover the floor between two corners (x, y)."""
+        """Build the grid of the floor between two corners (x, y)."""
         axes = [np.arange(low[k], high[k], _CELL_M) for k in (0, 1)]
         x, y = np.meshgrid(*axes, indexing="ij")
         levels = np.arange(*_COLUMN_M, free.voxel_m)
@@ -38,11 +38,11 @@ class Ways:
 
     @property
     def widest(self) -> tuple[Float64, NDArray[np.floating]]:
-        """Points (N, 2) of the grid and the free space around each (N,)."""
+        """Points (N, 2) of the grid and the clearance (N,) of each."""
         return self._points, self._room.ravel()
 
     def between(self, start: Float64, end: Float64) -> Float64 | None:
-        """Points (K, 2) from ``start`` (2,) to ``end`` (2,), both included, or None."""
+        """Route (K, 2) from ``start`` (2,) to ``end`` (2,), both included, or None."""
         first, last = self._nearest(start), self._nearest(end)
         if first is None or last is None:
             return None

@@ -1,4 +1,4 @@
-"""Mesh files by name: ``room.obj``, or with options ``room.glb,up=z,scale=0.01``."""
+"""Mesh files by name, with optional options: ``room.obj``, ``room.glb,up=z,scale=0.01``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def _by_trimesh(kind: str) -> Callable[[bytes, MeshFolder], list[Part]]:
-    """Read a format that names no other files and no sizes that are not checked."""
+    """Reader for formats that refer to no other files and contain no unchecked sizes."""
     import trimesh
 
     from ms_slam_env.scenes.mesh_formats.part import Part
@@ -41,11 +41,11 @@ def _by_trimesh(kind: str) -> Callable[[bytes, MeshFolder], list[Part]]:
     return read
 
 
-_READERS = {".glb": "gltf", ".gltf": "gltf", ".obj": "obj", ".ply": "ply"}  # modules beside
+_READERS = {".glb": "gltf", ".gltf": "gltf", ".obj": "obj", ".ply": "ply"}  # sibling modules
 
 
 def _reader(suffix: str) -> Callable[[bytes, MeshFolder], list[Part]]:
-    """What reads a format; loaded only when there is a file to read."""
+    """Reader of a format, imported only when needed."""
     if suffix not in _READERS:
         return _by_trimesh(suffix.removeprefix("."))
     kind = _READERS[suffix]
@@ -53,7 +53,7 @@ def _reader(suffix: str) -> Callable[[bytes, MeshFolder], list[Part]]:
 
 
 MESH_SUFFIXES = (*_READERS, ".stl", ".off")
-"""File formats of meshes."""
+"""Suffixes of mesh files."""
 
 _Y_UP = (".glb", ".gltf")
 _NAME = re.compile(rf"(.+({'|'.join(map(re.escape, MESH_SUFFIXES))}))((?:,[^,]*)*)", re.I | re.S)
@@ -61,11 +61,12 @@ _NAME = re.compile(rf"(.+({'|'.join(map(re.escape, MESH_SUFFIXES))}))((?:,[^,]*)
 
 @dataclass(frozen=True)
 class MeshOptions(Checked):
-    """How the numbers in a mesh file are meant.
+    """How to interpret the coordinates of a mesh file.
 
     Attributes:
-        up: the axis that points up: ``y``, ``z``, or that of the format: y of glTF, z of all else.
-        scale: metres that a unit of the file has.
+        up: the axis that points up: ``y``, ``z``, or the format's own: y for glTF, z for all
+            others.
+        scale: metres per unit of the file.
     """
 
     up: str = chosen("format", "format", "y", "z")
@@ -74,14 +75,14 @@ class MeshOptions(Checked):
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh file and its options, as they are named."""
+    """A mesh file with its options."""
 
     path: Path
     options: MeshOptions
 
     @classmethod
     def named(cls, name: object) -> MeshFile | None:
-        """What ``FILE[,option=value ...]`` names; None if that is no mesh file.
+        """Parse ``FILE[,option=value ...]``; None if it is not a mesh file.
 
         Raises:
             InputError: an unknown option, or a bad value.
@@ -94,19 +95,19 @@ class MeshFile:
         return cls(Path(path), from_dict(MeshOptions, given, f"mesh file {path!r}"))
 
     def check_exists(self) -> None:
-        """Refuse a file that is not there.
+        """Refuse a missing file.
 
         Raises:
-            InputError: naming it.
+            InputError: it names the file.
         """
         if not os.path.exists(self.path):
             raise InputError(f"mesh file {str(self.path)!r} does not exist")
 
     def read(self) -> list[Part]:
-        """Its parts, world z up, in metres.
+        """Read its parts, world z up, in metres.
 
         Raises:
-            InputError: no such file, or one that cannot be read.
+            InputError: the file is missing or cannot be read.
         """
         from ms_slam_env.scenes.mesh_formats.part import MeshFolder
 
@@ -114,12 +115,12 @@ class MeshFile:
         self.check_exists()
         data = read_bytes(self.path, "mesh file", MAX_MESH_BYTES)
         try:
-            with np.errstate(all="ignore"):  # what cannot be is refused below
+            with np.errstate(all="ignore"):  # invalid results are refused below
                 parts = _reader(self.path.suffix.lower())(data, MeshFolder(self.path))
                 shared = {id(part.vertices): part.vertices for part in parts}
                 placed = {key: self._placed(vertices) for key, vertices in shared.items()}
                 return [replace(part, vertices=placed[id(part.vertices)]) for part in parts]
-        except Exception as error:  # broken files raise anything
+        except Exception as error:  # damaged files raise anything
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(f"{kind} cannot be read: {reason}") from error
 

@@ -1,6 +1,6 @@
-"""glTF 2.0, as text or binary: what a surface looks like, without its animations.
+"""Reads glTF 2.0, text or binary: geometry and appearance, without animations.
 
-Nothing is allocated by a number in the file before that is compared with the bytes that are there.
+Sizes in the file are compared with the available bytes before anything is allocated.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ms_slam_env.scenes.mesh_formats.part import Image, MeshFolder, Part, check_
 _MAGIC, _JSON, _BIN = b"glTF", b"JSON", b"BIN\0"
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_MOST_COPIES = 2_000_000  # triangles that a file may place beyond those that it holds
+_MOST_COPIES = 2_000_000  # most triangles placed by instancing beyond those stored
 _TRIANGLES, _STRIP, _FAN, _POINTS = 4, 5, 6, 0
 
 _PLAIN = ("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp")
@@ -34,14 +34,14 @@ _COMPRESSED = {
     "KHR_meshopt_compression": "its meshes are compressed with meshopt",
     "KHR_texture_basisu": "its textures are compressed (KTX2, Basis Universal)",
 }
-_GEOMETRY = ("EXT_mesh_gpu_instancing",)  # places meshes without being required
+_GEOMETRY = ("EXT_mesh_gpu_instancing",)  # places meshes although a file need not require it
 
 
 def read_gltf(data: bytes, folder: MeshFolder) -> list[Part]:
-    """The parts of a file, y up as glTF has it, in metres.
+    """Read the parts of a file in metres, with y up as in glTF.
 
     Raises:
-        InputError: what the file needs and is not supported, or what its bytes do not hold.
+        InputError: the file needs unsupported features, or lacks data.
     """
     text, binary = _chunks(data) if data.startswith(_MAGIC) else (data, None)
     try:
@@ -58,7 +58,7 @@ def read_gltf(data: bytes, folder: MeshFolder) -> list[Part]:
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
-    """JSON and binary chunk of a GLB."""
+    """Split a GLB into its JSON and binary chunk."""
     found: list[bytes] = []
     place = 12
     for kind in (_JSON, _BIN):
@@ -94,7 +94,7 @@ def _whole(value: Any, what: str) -> int:
 
 
 class _Reader:
-    """One file, read."""
+    """Reads one file."""
 
     def __init__(
         self, tree: dict[str, Any], binary: bytes | None, folder: MeshFolder, size: int
@@ -107,7 +107,7 @@ class _Reader:
         self._positions: dict[int, Float64] = {}
 
     def parts(self) -> list[Part]:
-        """All meshes of the scene, where its nodes place them."""
+        """All meshes of the scene, placed by its nodes."""
         nodes = self._tree.get("nodes", [])
         scenes = self._tree.get("scenes")
         if scenes is None:
@@ -145,7 +145,7 @@ class _Reader:
         return found
 
     def _stored(self) -> int:
-        """Bytes that were read; a triangle has three at least."""
+        """Number of bytes read; a triangle has at least three."""
         return self._size + sum(map(len, self._buffers.values()))
 
     def _get(self, kind: str, index: Any) -> dict[str, Any]:
@@ -177,7 +177,7 @@ class _Reader:
             raise InputError(f"data URI: {error}") from None
 
     def _view(self, index: Any) -> tuple[memoryview, int]:
-        """Bytes of a buffer view, and its stride; 0 for none."""
+        """Bytes of a buffer view, and its stride; 0 if it has none."""
         entry = self._get("bufferViews", index)
         if "EXT_meshopt_compression" in entry.get("extensions", {}):
             raise InputError(f"{_COMPRESSED['EXT_meshopt_compression']}; export the file without")
@@ -189,7 +189,7 @@ class _Reader:
         return data[start : start + size], _whole(entry.get("byteStride", 0), "byteStride")
 
     def _rows(self, entry: dict[str, Any], count: int, dtype: str, columns: int) -> NDArray[Any]:
-        """Rows (count, columns) that lie in a buffer view; nothing is copied."""
+        """Rows (count, columns) of a buffer view, without copying."""
         data, stride = self._view(entry["bufferView"])
         start = _whole(entry.get("byteOffset", 0), "byteOffset")
         item = np.dtype(dtype).itemsize
@@ -203,7 +203,7 @@ class _Reader:
         return np.ndarray((count, columns), dtype, data, start, (stride, item))
 
     def _array(self, index: Any, columns: tuple[int, ...]) -> NDArray[Any]:
-        """Values (N, columns) of an accessor; integers that stand for fractions become these."""
+        """Values (N, columns) of an accessor; normalised integers become fractions."""
         entry = self._get("accessors", index)
         count, width = _whole(entry["count"], "count"), _COLUMNS[entry["type"]]
         dtype = _TYPES[entry["componentType"]]
@@ -241,7 +241,7 @@ class _Reader:
         return [part for one in entry["primitives"] if (part := self._primitive(one, name))]
 
     def _primitive(self, entry: dict[str, Any], name: str) -> Part | None:
-        """One surface in the axes of its node, None of what is neither surface nor points."""
+        """One surface in its node's axes; None if it is neither surface nor points."""
         mode, attributes = entry.get("mode", _TRIANGLES), entry["attributes"]
         if mode not in (_TRIANGLES, _STRIP, _FAN, _POINTS) or "POSITION" not in attributes:
             return None
@@ -276,13 +276,13 @@ class _Reader:
         return Part(name, vertices, faces, colours=self._of(colours, part) * factor)
 
     def _of(self, values: Float64, part: Part) -> Float64:
-        """Values of vertices at the corners of the faces."""
+        """Vertex values at the face corners."""
         if len(values) != len(part.vertices):
             raise InputError(f"{len(values)} values for {len(part.vertices)} vertices")
         return values[part.faces]
 
     def _material(self, index: Any) -> tuple[Image | None, Float64 | None, int, Any]:
-        """Image, colour, which texture coordinates, and what is done with these."""
+        """Image, colour, index of the texture coordinates, and their transform."""
         entry = {} if index is None else self._get("materials", index)
         glossy = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
         metallic = entry.get("pbrMetallicRoughness", {})
@@ -316,22 +316,22 @@ class _Reader:
 
 
 class _TextureTransform:
-    """KHR_texture_transform: scaled, turned, then moved."""
+    """KHR_texture_transform: scale, rotate, then translate."""
 
     def __init__(self, entry: dict[str, Any]) -> None:
         self._scale = np.asarray(entry.get("scale", (1.0, 1.0)), dtype=np.float64).reshape(2)
         self._offset = np.asarray(entry.get("offset", (0.0, 0.0)), dtype=np.float64).reshape(2)
         angle = float(entry.get("rotation", 0.0))
         c, s = np.cos(angle), np.sin(angle)
-        self._turn = np.array([[c, -s], [s, c]])  # rows times it: u' = c u + s v
+        self._turn = np.array([[c, -s], [s, c]])  # multiplied from the right: u' = c u + s v
 
     def __call__(self, uv: Float64) -> Float64:
-        """Coordinates (N, 2) of the image."""
+        """Transform coordinates (N, 2) to those of the image."""
         return uv * self._scale @ self._turn + self._offset
 
 
 def _faces(order: Int64, mode: int) -> Int64:
-    """Triangles (F, 3) of indices in the order of a list, a strip or a fan."""
+    """Triangles (F, 3) from the indices of a list, a strip or a fan."""
     if mode == _TRIANGLES:
         return order.reshape(-1, 3)
     if mode == _FAN:
@@ -365,7 +365,7 @@ def _moved(vertices: Float64, T_scene_node: Float64) -> Float64:
 
 
 def _placed(part: Part, vertices: Float64, T_scene_node: Float64) -> Part:
-    """A part with its vertices where its node is; mirrored, its faces are turned round."""
+    """Place a part by its node; flip the faces if the node mirrors."""
     if np.linalg.det(T_scene_node[:3, :3]) > 0:
         return replace(part, vertices=vertices)
     uv, colours = (None if one is None else one[:, ::-1] for one in (part.uv, part.colours))

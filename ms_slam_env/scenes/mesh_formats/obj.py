@@ -1,4 +1,4 @@
-"""Wavefront OBJ and its materials (MTL): a surface's colour and texture, no more of its shading."""
+"""Reads Wavefront OBJ with its materials (MTL): colour and texture, no other shading."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _WORDS_OF_OPTION = {
 
 @dataclass(frozen=True)
 class _Material:
-    """How a surface looks.
+    """A material's appearance.
 
     Attributes:
         colour: (3,) sRGB in [0, 255].
-        image: of the texture.
-        scale: (2,) that texture coordinates are multiplied by.
-        offset: (2,) that is added then.
+        image: texture image.
+        scale: (2,) factor on texture coordinates.
+        offset: (2,) added after scaling.
     """
 
     colour: Float64 | None = None
@@ -45,7 +45,7 @@ class _Material:
 
 @dataclass
 class _Group:
-    """Faces of one material: the words of each corner, face by face, and how many each has."""
+    """Faces of one material: each corner's word, face by face, and corners per face."""
 
     name: str
     corners: list[str] = field(default_factory=list)
@@ -53,10 +53,10 @@ class _Group:
 
 
 def read_obj(data: bytes, folder: MeshFolder) -> list[Part]:
-    """The parts of a file, one a material, or a cloud.
+    """Read the parts of a file, one per material, or a point cloud.
 
     Raises:
-        InputError: numbers that are none, or faces of vertices that are not there.
+        InputError: invalid numbers, or faces with missing vertices.
     """
     vertices: list[str] = []
     uv: list[str] = []
@@ -97,14 +97,14 @@ def read_obj(data: bytes, folder: MeshFolder) -> list[Part]:
 
 
 def _lines(text: str) -> Iterator[str]:
-    """Lines whose words are parted by one space, those that go on in the next joined."""
+    """Lines with words separated by single spaces; continued lines are joined."""
     for line in text.replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
         if line and not line.startswith("#"):
             yield " ".join(line.split())
 
 
 def _from_start(word: str, vertices: int, uv: int) -> str:
-    """A corner ``v/vt/vn`` whose numbers count from the file's start, not back from its place."""
+    """Make the indices of a corner ``v/vt/vn`` absolute; negative ones count back from here."""
     counts = (vertices, uv)
     parts = word.split("/")[:2]
     back = [part.startswith("-") for part in parts]
@@ -115,7 +115,7 @@ def _from_start(word: str, vertices: int, uv: int) -> str:
 
 
 def _table(rows: list[str], least: int) -> Float64:
-    """Numbers (N, k) of rows; of rows of unlike length as many as the shortest has."""
+    """Parse rows to numbers (N, k); k is the length of the shortest row."""
     if not rows:
         return np.zeros((0, least))
     words = [row.count(" ") + 1 for row in rows]
@@ -128,13 +128,13 @@ def _table(rows: list[str], least: int) -> Float64:
 
 
 def _vertices(rows: list[str]) -> tuple[Float64, Float64 | None]:
-    """Places (V, 3), and colours (V, 3) in [0, 255] if all have some."""
+    """Positions (V, 3), and colours (V, 3) in [0, 255] if every vertex has one."""
     table = _table(rows, 3)
     return table[:, :3], bytes_of_colours(table[:, 3:6]) if table.shape[1] >= 6 else None
 
 
 def _indices(words: list[str]) -> tuple[Int64, Int64]:
-    """Numbers (C,) of vertex and texture coordinate of corners, from 1; 0 where there is none."""
+    """Vertex and texture-coordinate indices (C,) of corners, from 1; 0 = none."""
     slashes = {word.count("/") for word in words}
     text = " ".join(words)
     if len(slashes) == 1 and "//" not in text:
@@ -154,17 +154,17 @@ def _part(
     if vertex.min() < 1 or coordinate.min() < 0 or coordinate.max() > len(uv):
         raise InputError("a face refers to a vertex beyond the last")
     faces = vertex[fans.corners] - 1
-    part = Part(group.name, places, faces, tint=material.colour)  # refuses other vertices
+    part = Part(group.name, places, faces, tint=material.colour)  # refuses missing vertices
     if material.image is not None:
-        centre = np.concatenate([uv, [[0.5, 0.5]]])  # the last one for corners without any
+        centre = np.concatenate([uv, [[0.5, 0.5]]])  # the last row is for corners without any
         corners = centre[coordinate[fans.corners] - 1] * material.scale + material.offset
-        corners = corners * (1.0, -1.0) + (0.0, 1.0)  # the file has v pointing up
+        corners = corners * (1.0, -1.0) + (0.0, 1.0)  # v points up in the file
         return replace(part, uv=corners, image=material.image, tint=None)
     return part if colours is None else replace(part, colours=colours[faces], tint=None)
 
 
 def _materials(libraries: list[str], folder: MeshFolder) -> dict[str, _Material]:
-    """Materials by name of all libraries, whose names may have spaces or be several in a line."""
+    """Materials of all libraries by name; a line may list several files, with spaces in names."""
     found: dict[str, _Material] = {}
     for line in libraries:
         try:
@@ -203,7 +203,7 @@ def _library(text: str, folder: MeshFolder) -> dict[str, _Material]:
 
 
 def _map(text: str) -> tuple[str, Float64, Float64]:
-    """File, scale (2,) and offset (2,) of a texture: options, then a name that may have spaces."""
+    """Parse a texture's file, scale (2,) and offset (2,): options, then a name with spaces."""
     values = {"-s": np.ones(2), "-o": np.zeros(2)}
     while (option := text.partition(" ")[0]) in _WORDS_OF_OPTION:
         text = text.partition(" ")[2].lstrip()

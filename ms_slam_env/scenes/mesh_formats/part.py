@@ -1,4 +1,4 @@
-"""What the readers of mesh files give, and the files that a mesh file names."""
+"""Parts returned by mesh readers, and access to the files that a mesh file refers to."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from ms_slam_env.camera.image_files import decode_texture
 from ms_slam_env.errors import InputError, InputWarning
 
 MAX_TRIANGLES = 10_000_000
-"""Of a mesh file: some 4 GB of memory."""
+"""Limit for a mesh file: about 4 GB of memory."""
 
 MAX_TEXELS = 2**28
-"""Of all textures of a mesh file, shrunk."""
+"""Limit for all textures of a mesh file, after shrinking."""
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ class Part:
     """Triangles of one material.
 
     Attributes:
-        name: in the file.
+        name: name in the file.
         vertices: (V, 3) in the file's unit and axes.
-        faces: (F, 3) indices of vertices; none in a cloud.
+        faces: (F, 3) indices of vertices; none in a point cloud.
         uv: (F, 3, 2) of ``image``, u along columns, v along rows from the top.
         image: (h, w, 3) sRGB.
-        tint: (3,) sRGB in [0, 255] that the image is multiplied by; without an image, the colour.
-        colours: (F, 3, 3) sRGB in [0, 255] of the corners, where there is no image.
+        tint: (3,) sRGB factor in [0, 255] on the image; without an image, the colour.
+        colours: (F, 3, 3) sRGB in [0, 255] at the corners, if there is no image.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Part:
     colours: Float64 | None = None
 
     def __post_init__(self) -> None:
-        """Refuse too many faces, and those of vertices that are not there."""
+        """Refuse too many faces, and faces with missing vertices."""
         check_size(len(self.faces))
         if self.faces.size and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
             raise InputError(
@@ -57,11 +57,11 @@ class Part:
 
 @dataclass(frozen=True)
 class Polygons:
-    """Polygons one after the other, cut into fans of triangles.
+    """Concatenated polygons, cut into triangle fans.
 
     Attributes:
-        corners: (T, 3) places of the triangles' corners in the list of all polygons' corners.
-        polygon: (T,) the polygon of each triangle.
+        corners: (T, 3) indices of the triangles' corners in the list of all polygons' corners.
+        polygon: (T,) polygon of each triangle.
     """
 
     corners: Int64
@@ -69,7 +69,7 @@ class Polygons:
 
     @classmethod
     def of_lengths(cls, lengths: Int64) -> Polygons:
-        """Cut polygons of ``lengths`` (P,) corners; those of fewer than three give nothing.
+        """Cut polygons with ``lengths`` (P,) corners; those with fewer than three are dropped.
 
         Raises:
             InputError: more triangles than a mesh may have.
@@ -84,10 +84,10 @@ class Polygons:
 
 
 def check_size(triangles: int, most: int | None = None) -> None:
-    """Refuse more triangles than a mesh may have: ``MAX_TRIANGLES``, or ``most`` if that is less.
+    """Refuse more triangles than ``MAX_TRIANGLES``, or than ``most`` if that is less.
 
     Raises:
-        InputError: with both numbers.
+        InputError: it names both numbers.
     """
     most = MAX_TRIANGLES if most is None else min(most, MAX_TRIANGLES)
     if triangles > most:
@@ -95,14 +95,14 @@ def check_size(triangles: int, most: int | None = None) -> None:
 
 
 class MissingFileError(InputError):
-    """A file that a mesh file names is not in its folder."""
+    """A file that a mesh file refers to is not in its folder."""
 
 
 @dataclass
 class MeshFolder:
-    """The files that a mesh file may name: regular ones, in its folder or below.
+    """Files that a mesh file may refer to: regular files in its folder or below.
 
-    Together they are at most as large as a mesh file may be. Each is read once.
+    Their total size is limited to that of a mesh file. Each is read once.
 
     Attributes:
         mesh: the mesh file.
@@ -113,12 +113,13 @@ class MeshFolder:
     _images: dict[object, Image] = field(default_factory=dict)
 
     def find(self, name: str) -> Path:
-        """The file that ``name`` means: ``\\`` parts folders, too, and upper is lower case.
+        """Find the file ``name``; ``\\`` also separates folders, and case is ignored.
 
-        An absolute path, as of another machine, means the file of that name beside the mesh.
+        An absolute path, such as from another machine, refers to the file of that name beside the
+        mesh.
 
         Raises:
-            MissingFileError: there is none, or it lies outside of the folder.
+            MissingFileError: there is none, or it is outside the folder.
         """
         folder = Path(os.path.abspath(self.mesh)).parent
         given = PurePosixPath(name.strip().strip('"').replace("\\", "/"))
@@ -131,11 +132,11 @@ class MeshFolder:
         raise MissingFileError(f"{self.mesh.name} names {name!r}, which {why}")
 
     def read(self, name: str, kind: str, most_bytes: int = MAX_MESH_BYTES) -> bytes:
-        """What a file holds.
+        """Read a file's content.
 
         Raises:
             MissingFileError: see `find`.
-            InputError: no regular file, or too large.
+            InputError: not a regular file, or too large.
         """
         path = self.find(name)
         if path not in self._bytes:
@@ -146,10 +147,10 @@ class MeshFolder:
         return self._bytes[path]
 
     def texture(self, name: str) -> Image | None:
-        """The image in a file; None, and a warning that names it, where it is missing.
+        """Read an image file; if it is missing, warn and return None.
 
         Raises:
-            InputError: no regular file, too large, or no image.
+            InputError: not a regular file, too large, or not an image.
         """
         try:
             path = self.find(name)
@@ -159,7 +160,7 @@ class MeshFolder:
             return None
 
     def image(self, key: object, data: bytes, name: str) -> Image:
-        """Decode an image once for each ``key``; ``name`` is for errors."""
+        """Decode an image once per ``key``; ``name`` is for error messages."""
         if key not in self._images:
             self._images[key] = decode_texture(data, f"texture {name}")
             if sum(image.shape[0] * image.shape[1] for image in self._images.values()) > MAX_TEXELS:
@@ -167,12 +168,12 @@ class MeshFolder:
         return self._images[key]
 
     def warn(self, text: str) -> None:
-        """Say what of the file is not taken."""
+        """Warn about a part of the file that is ignored."""
         warnings.warn(f"mesh file {str(self.mesh)!r}: {text}", InputWarning, 4)
 
 
 def _matching(folder: Path, parts: tuple[str, ...]) -> Path | None:
-    """The file at ``parts`` below ``folder``, whatever the case of letters."""
+    """The file at ``parts`` below ``folder``, ignoring case."""
     here = folder
     for part in parts:
         if not os.path.lexists(here / part):
@@ -188,7 +189,7 @@ def _matching(folder: Path, parts: tuple[str, ...]) -> Path | None:
 
 
 def text_of(data: bytes) -> str:
-    """The text of a file: UTF-8, with or without a byte order mark, else Latin-1."""
+    """Decode text: UTF-8, with or without a byte order mark, else Latin-1."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -196,7 +197,7 @@ def text_of(data: bytes) -> str:
 
 
 def bytes_of_colours(values: NDArray[Any]) -> Float64:
-    """Colours in [0, 255] of integers of 8 or 16 bits, or of floats in [0, 1]."""
+    """Convert colours to [0, 255] from 8-bit or 16-bit integers, or floats in [0, 1]."""
     colours = np.nan_to_num(np.asarray(values, dtype=np.float64))
     if values.dtype.kind == "u" and values.dtype.itemsize == 2:
         colours = colours / 257.0
@@ -206,7 +207,7 @@ def bytes_of_colours(values: NDArray[Any]) -> Float64:
 
 
 def columns_of(table: Mapping[str, NDArray[Any]], *choices: tuple[str, ...]) -> NDArray[Any] | None:
-    """The columns of the first of ``choices`` whose names are all there, beside each other."""
+    """Stack the columns of the first of ``choices`` whose names are all present."""
     for names in choices:
         if all(name in table for name in names):
             return np.stack([table[name] for name in names], -1)

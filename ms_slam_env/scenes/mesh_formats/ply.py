@@ -1,4 +1,4 @@
-"""PLY, as text or binary of either byte order: vertices, polygons, colours, textures."""
+"""Reads PLY, text or binary of either byte order: vertices, polygons, colours, textures."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _INDICES = ("vertex_indices", "vertex_index")
 
 @dataclass(frozen=True)
 class _Property:
-    """A number, or a list of numbers if ``count`` is the type of its length."""
+    """A scalar property, or a list if ``count`` is set to the type of its length."""
 
     name: str
     kind: str
@@ -51,7 +51,7 @@ class _Property:
 
 @dataclass
 class _List:
-    """Lists one after the other: lengths (N,), and all values."""
+    """Concatenated lists: lengths (N,), and all values."""
 
     lengths: Int64
     values: NDArray[Any]
@@ -59,7 +59,7 @@ class _List:
 
 @dataclass
 class _Element:
-    """What the header says of an element, and then what the file holds."""
+    """An element: its header, and later its data."""
 
     name: str
     length: int
@@ -69,15 +69,15 @@ class _Element:
 
 
 def read_ply(data: bytes, folder: MeshFolder) -> list[Part]:
-    """The parts of a file, one a texture, or a cloud.
+    """Read the parts of a file, one per texture, or a point cloud.
 
     Raises:
-        InputError: a broken header, or less data than it says.
+        InputError: an invalid header, or less data than it declares.
     """
     header, body = _split(data)
     order, elements, textures = _parse(header)
     is_text = order == "="
-    if is_text:  # all numbers are alike, and are read as a binary file of them is
+    if is_text:  # all numbers get one type and are read like a binary file
         body, order = np.fromstring(text_of(body), sep=" ").tobytes(), "<"
     place = 0
     for element in elements.values():
@@ -92,7 +92,7 @@ def read_ply(data: bytes, folder: MeshFolder) -> list[Part]:
 
 
 def _split(data: bytes) -> tuple[list[str], bytes]:
-    """Lines of the header, and what follows it."""
+    """Split into the header's lines and the body."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     end = data.find(b"end_header", 0, _MOST_HEADER_BYTES)
     newline = data.find(b"\n", end)
@@ -102,7 +102,7 @@ def _split(data: bytes) -> tuple[list[str], bytes]:
 
 
 def _parse(header: list[str]) -> tuple[str, dict[str, _Element], list[str]]:
-    """Byte order (``=`` for text), elements by name, and names of textures."""
+    """Parse the header: byte order (``=`` for text), elements by name, texture names."""
     order, elements, textures = "", {}, []
     element = _Element("", 0)
     for line in header[1:]:
@@ -131,7 +131,7 @@ def _parse(header: list[str]) -> tuple[str, dict[str, _Element], list[str]]:
 
 
 def _read(element: _Element, body: bytes, place: int, order: str) -> int:
-    """Read an element from ``place``; return where it ends."""
+    """Read an element starting at ``place``; return the end position."""
     properties = element.properties
     if not properties or not element.length:
         return place
@@ -166,7 +166,7 @@ def _read(element: _Element, body: bytes, place: int, order: str) -> int:
 def _walk(
     properties: list[_Property], count: int, body: bytes, place: int, order: str
 ) -> tuple[list[_List], int]:
-    """Read ``count`` records one by one; return each property's values, and where they end."""
+    """Read ``count`` records one by one; return each property's values, and the end position."""
     check_size(count)
     pieces: list[list[bytes]] = [[] for _ in properties]
     lengths: list[list[int]] = [[] for _ in properties]
@@ -212,7 +212,7 @@ def _parts(elements: dict[str, _Element], textures: list[str], folder: MeshFolde
         return [Part(name, vertices, np.zeros((0, 3), np.int64))]
     fans = Polygons.of_lengths(indices.lengths)
     faces = indices.values.astype(np.int64)[fans.corners]
-    whole = Part(name, vertices, faces)  # refuses faces of other vertices
+    whole = Part(name, vertices, faces)  # refuses missing vertices
     if textures and (uv := _uv(of_vertex, face, indices, fans, faces)) is not None:
         which = np.zeros(len(faces), np.int64)
         if len(textures) > 1 and "texnumber" in face.numbers:
@@ -237,7 +237,7 @@ def _parts(elements: dict[str, _Element], textures: list[str], folder: MeshFolde
 def _uv(
     of_vertex: dict[str, NDArray[Any]], face: _Element, indices: _List, fans: Polygons, faces: Int64
 ) -> Float64 | None:
-    """Texture coordinates (T, 3, 2), of the faces' corners or else of the vertices."""
+    """Texture coordinates (T, 3, 2), from the faces' corners or else from the vertices."""
     corners = face.lists.get("texcoord")
     if corners is not None and (corners.lengths == 2 * indices.lengths).all():
         uv = corners.values.reshape(-1, 2)[fans.corners]
@@ -245,4 +245,4 @@ def _uv(
         uv = columns[faces]
     else:
         return None
-    return uv.astype(np.float64) * (1.0, -1.0) + (0.0, 1.0)  # the file has v pointing up
+    return uv.astype(np.float64) * (1.0, -1.0) + (0.0, 1.0)  # v points up in the file

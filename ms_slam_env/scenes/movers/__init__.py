@@ -1,4 +1,4 @@
-"""Things that move through a scene: a parcel, a walking person, a car."""
+"""Objects that move through a scene: a box, a walking person, a car."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from ms_slam_env.scenes.movers.shape import Joint, Part, Shape, box
 from ms_slam_env.scenes.scene import Rng
 
 MOVERS: dict[str, Callable[[Rng], Shape]] = {"box": box, "person": person, "car": car}
-"""Kind to what builds one from random numbers."""
+"""Builder of each kind, which takes a random generator."""
 
 
 def make_mover(kind: str, rng: Rng) -> Shape:
-    """Build a thing that moves; the same random numbers give the same thing.
+    """Build a moving object; the same random numbers give the same object.
 
     Raises:
         InputError: unknown kind.

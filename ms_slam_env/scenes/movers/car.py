@@ -19,8 +19,8 @@ def car(rng: Rng, length_m: float | None = None) -> Shape:
     """Painted body, windows, lights, plates and rolling wheels; the origin is on the ground.
 
     Args:
-        rng: draws paint, proportions and what is not given.
-        length_m: over all.
+        rng: draws paint, proportions and omitted values.
+        length_m: overall length.
     """
     length = float(length_m if length_m is not None else rng.uniform(*_LENGTH_M))
     width, height = rng.uniform(1.68, 1.82), rng.uniform(1.42, 1.55)

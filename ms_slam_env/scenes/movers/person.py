@@ -25,7 +25,7 @@ def person(rng: Rng, stature_m: float | None = None) -> Shape:
     0.53, shoulder at 0.82, chin at 0.87 of the stature).
 
     Args:
-        rng: draws clothes, hair, skin and what is not given.
+        rng: draws clothes, hair, skin and omitted values.
         stature_m: height.
     """
     h = float(stature_m if stature_m is not None else rng.uniform(*_STATURE_M))

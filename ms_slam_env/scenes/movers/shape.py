@@ -1,4 +1,4 @@
-"""What a thing that moves is made of: rigid parts, some of which swing or roll as it goes."""
+"""Moving objects made of rigid parts, some of which swing or roll as the object moves."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from ms_slam_env.scenes.textures import pictures
 from ms_slam_env.scenes.textures.noise import grain, hsv
 
 _OPENNESS_RAYS = 24
-_DARKEST = 0.25  # of the light around, where nothing of it arrives directly
+_DARKEST = 0.25  # share of the surrounding light where none arrives directly
 
 
 @dataclass(frozen=True)
 class Joint:
-    """How a part moves in the frame of the whole while that goes ``s`` metres.
+    """Motion of a part in the object's frame as the object moves ``s`` metres.
 
     Its angle is swing_rad * sin(2 pi s / stride_m + phase_rad) + s * roll_rad_m.
 
     Attributes:
-        pivot: (3,) a point of the axis, in the frame of the whole.
+        pivot: (3,) a point on the axis, in the object's frame.
         axis: (3,) unit vector.
-        swing_rad: amplitude to and fro.
-        stride_m: distance of one swing to and fro.
-        phase_rad: of the swing at s = 0.
-        roll_rad_m: angle a metre.
+        swing_rad: amplitude of the swing.
+        stride_m: distance per full swing.
+        phase_rad: phase of the swing at s = 0.
+        roll_rad_m: rolling angle per metre.
     """
 
     pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -43,7 +43,7 @@ class Joint:
     roll_rad_m: float = 0.0
 
     def pose(self, s: Float64) -> Float64:
-        """T_whole_part (..., 4, 4) after ways (...) in metres."""
+        """T_whole_part (..., 4, 4) after travelled distances (...) in metres."""
         angle = self.swing_rad * np.sin(2 * np.pi * s / self.stride_m + self.phase_rad)
         angle = np.asarray(angle + s * self.roll_rad_m)
         turns = np.asarray(self.axis) * angle.reshape(-1, 1)
@@ -56,11 +56,11 @@ class Joint:
 
 @dataclass(frozen=True)
 class Part:
-    """A rigid piece.
+    """A rigid part.
 
     Attributes:
-        mesh: in the frame of the whole, at angle 0; ``irradiance`` is the share of the light
-            around that reaches a corner.
+        mesh: mesh in the object's frame at angle 0; ``irradiance`` is the share of the surrounding
+            light that reaches each corner.
         joint: how it moves in that frame.
     """
 
@@ -70,16 +70,16 @@ class Part:
 
 @dataclass(frozen=True)
 class Shape:
-    """A thing that moves: x points ahead, z up.
+    """A moving object: x points ahead, z up.
 
     Attributes:
-        kind: of what it is.
-        parts: its pieces.
-        radius_m: of the circle about the z axis that it fits in.
-        length_m: along the direction of travel, its middle at the origin.
-        width_m: across it, likewise.
-        height_m: above the origin.
-        depth_m: below the origin; 0 for what stands on the ground.
+        kind: kind of object.
+        parts: its parts.
+        radius_m: radius of the enclosing circle about the z axis.
+        length_m: extent along the direction of travel, centred at the origin.
+        width_m: extent across it, centred at the origin.
+        height_m: extent above the origin.
+        depth_m: extent below the origin; 0 for objects that stand on the ground.
     """
 
     kind: str
@@ -92,11 +92,11 @@ class Shape:
 
 
 Piece = tuple[Callable[[MeshBuilder], None], Joint]
-"""What adds the patches of a part to a builder, and the part's joint."""
+"""A function that adds a part's patches to a builder, and the part's joint."""
 
 
 def assemble(pieces: list[Piece], cell_m: float, ground_z: float | None = 0.0) -> tuple[Part, ...]:
-    """Build the parts, with the light that each corner loses to the others and to the ground."""
+    """Build the parts, with the occlusion of each corner by the others and the ground."""
     geometries = []
     for add, _ in pieces:
         builder = MeshBuilder(cell_m)
@@ -115,7 +115,7 @@ def assemble(pieces: list[Piece], cell_m: float, ground_z: float | None = 0.0) -
 
 
 def _openness(g: Geometry, rays: RayCaster, ground_z: float | None) -> Float32:
-    """Share (F, 3, 3) of the cosine-weighted directions from which light arrives at corners."""
+    """Share (F, 3, 3) of cosine-weighted directions from which light reaches each corner."""
     total = np.zeros(len(g.vertices), np.float32)
     for direction in hemispheres(g.normals, _OPENNESS_RAYS):
         distance, _ = rays.first_hit(g.light_points, direction)
@@ -133,11 +133,11 @@ _SIDES = "xXyYzZ"
 
 
 def box(rng: Rng, size_m: tuple[float, float, float] | None = None) -> Shape:
-    """Cardboard with prints, labels and tape; its origin is its middle.
+    """Cardboard box with prints, labels and tape; its origin is its centre.
 
     Args:
-        rng: draws colours, prints and what is not given.
-        size_m: along x, y and z.
+        rng: draws colours, prints and omitted values.
+        size_m: size along x, y and z.
     """
     half = 0.5 * np.array(size_m if size_m is not None else rng.uniform(*_SIZE_M, 3))
     paper = hsv(rng.uniform(0.06, 0.11), rng.uniform(0.3, 0.55), rng.uniform(0.55, 0.8))

@@ -1,1 +1,1 @@
-"""What stands outdoors: streets, houses, facades, trees, cars, lamp posts; builders of patches."""
+"""Builders of outdoor objects: streets, houses, facades, trees, cars, lamp posts."""

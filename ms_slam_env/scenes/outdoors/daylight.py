@@ -42,7 +42,7 @@ def sky_dome(build: MeshBuilder, rng: Rng, centre: tuple[float, float]) -> None:
 _KEY = 0.16
 _MOST_EXPOSED = 0.85
 _EYE_M = (1.4, 1.8)
-_STRAY_M = 0.5  # across the street
+_STRAY_M = 0.5  # sideways deviation of start poses, across the street
 _DEPTH_OF_VIEW_M = (3.0, 8.0)
 
 
@@ -55,16 +55,16 @@ def daylight_scene(
     places: Mapping[str, Float64],
     ways: tuple[tuple[str, str], ...],
 ) -> LargeScene:
-    """Light what was built, from a sun 35 to 55 degrees high, and make the scene.
+    """Light the built mesh by a sun 35 to 55 degrees high, and make the scene.
 
     Args:
-        maker: of the scene.
-        seed: of the scene.
-        build: everything but the sky.
-        rng: draws the sun's place.
-        plan: of the streets.
+        maker: maker of the scene.
+        seed: seed of the scene.
+        build: everything except the sky.
+        rng: draws the sun's position.
+        plan: plan of the streets.
         places: points (3,) on the ground where routes turn, by name.
-        ways: pairs of places between which a start pose may lie.
+        ways: pairs of places between which start poses may lie.
     """
     x0, y0, x1, y1 = plan.bounds
     sky_dome(build, rng, ((x0 + x1) / 2, (y0 + y1) / 2))
@@ -81,7 +81,7 @@ def daylight_scene(
     )
     middles = np.array([0.5 * (places[a] + places[b]) for a, b in ways])
     eyes = middles + np.array([0.0, 0.0, 1.6])
-    # Between tall houses most is shade; exposed for it alone, what lies in the sun would be white.
+    # Between tall houses most is shade; exposed for that alone, sunlit surfaces would be white.
     mesh, exposure = light_and_expose(build, lighting, eyes, _KEY)
 
     def start(draw: Rng) -> tuple[Float64, Float64]:

@@ -21,7 +21,7 @@ TOWN_STOREY_M = 3.1
 
 @dataclass(frozen=True)
 class Finishes:
-    """What the houses of a quarter are made of; each house draws from these."""
+    """Materials of a quarter's houses; each house draws from these."""
 
     walls: tuple[Material, ...]
     roofs: tuple[Material, ...]
@@ -77,7 +77,7 @@ def window(
     size: tuple[float, float],
     has_sill: bool = True,
 ) -> None:
-    """Window on the wall at y = 0, front at -y; ``at`` is its middle (x, z)."""
+    """Window on the wall at y = 0, front at -y; ``at`` is its centre (x, z)."""
     (x, z), (w, h) = at, (size[0] / 2, size[1] / 2)
     build.box((x - w, -0.06, z - h), (x + w, 0, z + h), frame, "Y", front=image)
     if has_sill:
@@ -135,7 +135,7 @@ def house(
 def _gable_roof(
     build: MeshBuilder, width: float, depth: float, eaves: float, tiles: Material, wall: Material
 ) -> None:
-    """Ridge along x over the middle, 0.35 m of overhang."""
+    """Gable roof with its ridge along x over the middle, and 0.35 m of overhang."""
     over, rise = 0.35, 0.42 * depth
     slope: Float64 = np.array([0.0, depth / 2 + over, rise * (1 + 2 * over / depth)])
     low = eaves - rise * 2 * over / depth
@@ -143,7 +143,7 @@ def _gable_roof(
     build.quad((-over, -over, low), span, slope, tiles)
     back = slope * [1, -1, 1]
     build.quad((width + over, depth + over, low), (-span[0], 0, 0), back, tiles)
-    # The undersides, so that the overhang is no hole seen from below.
+    # The undersides, so that the overhang is closed when seen from below.
     ridge = eaves + rise - 0.05
     build.quad((-over, depth / 2, ridge), span, -slope, wall)
     build.quad((width + over, depth / 2, ridge), (-span[0], 0, 0), -back, wall)
@@ -159,7 +159,7 @@ _SIGNS = ("BAKERY", "CAFE", "BOOKS", "HOTEL", "SHOES", "BANK", "PIZZA", "PHOTO",
 
 @dataclass(frozen=True)
 class TownFinishes:
-    """What the houses of a town are made of; each house draws from these."""
+    """Materials of a town's houses; each house draws from these."""
 
     walls: tuple[Material, ...]
     stones: tuple[Material, ...]

@@ -1,4 +1,4 @@
-"""A grid of streets: where the carriageway, the pavements and the plots lie."""
+"""Street grids: layout of carriageways, pavements and plots."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Plot:
 
     Attributes:
         origin: (3,) left end, seen from the street, of its edge along the pavement; metres.
-        yaw: of its frame about z: x along the street, y away from it.
+        yaw: rotation of its frame about z: x along the street, y away from it.
         width_m: along the street.
         depth_m: away from the street.
     """
@@ -34,7 +34,7 @@ class Plot:
 def sides_of(
     width: float, depth: float
 ) -> tuple[tuple[tuple[float, float, float], float, float], ...]:
-    """Origin, yaw and length of each side of a rectangle, seen from outside from left to right."""
+    """Origin, yaw and length of each side of a rectangle, left to right seen from outside."""
     return (
         ((0, 0, 0), 0.0, width),
         ((width, 0, 0), np.pi / 2, depth),
@@ -48,8 +48,8 @@ class StreetPlan:
     """Streets along x and y that cross at right angles.
 
     Attributes:
-        xs: x of the centre lines of the streets that run along y, increasing, metres.
-        ys: y of the centre lines of those that run along x.
+        xs: x of the centre lines of the streets along y, increasing, metres.
+        ys: y of the centre lines of the streets along x.
         road_m: width of the carriageway.
         pavement_m: width of each pavement.
         margin_m: depth of the plots around the outermost streets.
@@ -63,15 +63,15 @@ class StreetPlan:
 
     @property
     def half_m(self) -> float:
-        """From a centre line to the plots."""
+        """Distance from a centre line to the plots."""
         return 0.5 * self.road_m + self.pavement_m
 
     def crossing(self, column: int, row: int) -> Float64:
-        """Point (3,) where street ``column`` of ``xs`` meets street ``row`` of ``ys``."""
+        """Point (3,) where street ``column`` of ``xs`` crosses street ``row`` of ``ys``."""
         return np.array([self.xs[column], self.ys[row], 0.0])
 
     def crossings(self, names: tuple[tuple[str, ...], ...]) -> dict[str, Float64]:
-        """Crossings (3,) by their names, given in rows along x."""
+        """Crossings (3,) by name; names are given in rows along x."""
         return {
             name: self.crossing(column, row)
             for row, those in enumerate(names)
@@ -80,7 +80,7 @@ class StreetPlan:
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """Least x, least y, greatest x, greatest y of the ground."""
+        """Minimum x, minimum y, maximum x, maximum y of the ground."""
         out = self.half_m + self.margin_m
         return self.xs[0] - out, self.ys[0] - out, self.xs[-1] + out, self.ys[-1] + out
 
@@ -115,7 +115,7 @@ class StreetPlan:
                     build.quad((x0, y1, 0), (x1 - x0, 0, 0), up, kerb)
 
     def blocks(self) -> Iterator[Plot]:
-        """Plots between the streets, facing the street at their least y."""
+        """Plots between the streets, facing the street at their minimum y."""
         for x0, x1 in pairwise(self.xs):
             for y0, y1 in pairwise(self.ys):
                 h = self.half_m
@@ -131,7 +131,7 @@ class StreetPlan:
         yield Plot((x1 - m, y1 - m, KERB_M), -np.pi / 2, y1 - y0 - 2 * m, m)
 
     def lanes(self) -> tuple[tuple[Float64, Float64], ...]:
-        """Ways of cars on the sides of the streets where none is parked (see ``kerbsides``)."""
+        """Car lanes on the sides of the streets without parked cars (see ``kerbsides``)."""
         aside = 0.27 * self.road_m
         (x0, x1), (y0, y1) = (self.xs[0], self.xs[-1]), (self.ys[0], self.ys[-1])
         along_x = [
@@ -143,10 +143,10 @@ class StreetPlan:
         return (*along_x, *along_y)
 
     def kerbsides(self) -> Iterator[tuple[Float64, float, float]]:
-        """Edges of the blocks: middle (3,), yaw (x along, y off the street) and length.
+        """Edges of the blocks: centre (3,), yaw (x along, y away from the street) and length.
 
-        Four for each block; the first two of the four face streets that no other block's first
-        two face, so that cars parked along these leave room on the other side.
+        Four per block. No two blocks' first two edges face the same stretch of street, so cars
+        parked along these leave room on the other side.
         """
         for plot in self.blocks():
             half_size = np.array([plot.width_m / 2, plot.depth_m / 2, 0.0])

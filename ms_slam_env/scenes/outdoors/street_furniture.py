@@ -1,4 +1,4 @@
-"""Along a street: lamp posts, cars, signs, bins, benches, crossings; trees, hedges, fences."""
+"""Street furniture: lamp posts, cars, signs, bins, benches, crossings; trees, hedges, fences."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ms_slam_env.scenes.textures.noise import grain, hsv
 
 
 def lamp_post(build: MeshBuilder, height_m: float, name: str) -> None:
-    """Post on the origin with an arm and a head towards -y."""
+    """Post at the origin with an arm and a head towards -y."""
     metal = build.plain((72, 78, 76))
     glass = build.plain((236, 236, 226))
     with build.object(name):
@@ -24,7 +24,7 @@ def lamp_post(build: MeshBuilder, height_m: float, name: str) -> None:
 
 
 def car(build: MeshBuilder, rng: Rng, name: str) -> None:
-    """Parked car on the origin, 4.1 m long, front at +x."""
+    """Parked car at the origin, 4.1 m long, front at +x."""
     hue, strength = rng.choice([0.0, 0.03, 0.12, 0.38, 0.58, 0.62]), rng.choice([0.04, 0.1, 0.65])
     colour = hsv(hue, strength, rng.uniform(0.3, 0.9))
     paint = build.material(grain(rng, colour, (128, 128), (0.03, 1.2), (0.02, 0.3)), (1.5, 1.5))
@@ -89,7 +89,7 @@ def sign(build: MeshBuilder, rng: Rng, text: str, name: str) -> None:
 
 
 def bin_(build: MeshBuilder, rng: Rng, name: str) -> None:
-    """Wheeled refuse bin on the origin."""
+    """Wheeled refuse bin at the origin."""
     colour = hsv(rng.choice([0.1, 0.33, 0.6]), rng.uniform(0.2, 0.7), rng.uniform(0.2, 0.5))
     plastic = build.material(interior.plaster(rng, colour, 3.0, 64), (0.6, 0.6))
     with build.object(name):
@@ -179,7 +179,7 @@ def lump(
 def tree(
     build: MeshBuilder, rng: Rng, bark: Material, leaves: Material, height_m: float, name: str
 ) -> None:
-    """Trunk with a crown of lumps, standing on the origin."""
+    """Trunk with a crown of lumps, standing at the origin."""
     trunk = 0.42 * height_m
     r = 0.035 * height_m
     lean = rng.uniform(-0.1, 0.1, 2)
@@ -198,7 +198,7 @@ def tree(
 
 
 def bush(build: MeshBuilder, rng: Rng, leaves: Material, radius_m: float, name: str) -> None:
-    """Round bush on the origin."""
+    """Round bush at the origin."""
     with build.object(name):
         size = (radius_m, radius_m, 0.85 * radius_m)
         lump(build, rng, (0, 0, 0.6 * radius_m), size, leaves, 0.3)
@@ -207,7 +207,7 @@ def bush(build: MeshBuilder, rng: Rng, leaves: Material, radius_m: float, name: 
 def hedge(
     build: MeshBuilder, leaves: Material, length_m: float, height_m: float, name: str
 ) -> None:
-    """Cut hedge along x from the origin, 0.5 m thick."""
+    """Trimmed hedge along x from the origin, 0.5 m thick."""
     with build.object(name):
         build.box((0, 0, 0), (length_m, 0.5, height_m), leaves, "z")
 

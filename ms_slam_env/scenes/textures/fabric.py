@@ -115,7 +115,7 @@ def _band(rng: Rng, size: int, cycles: float) -> Field:
 
 
 def carpet_pile(rng: Rng, rgb: ArrayLike, size: int = 512) -> Image:
-    """Loop pile in rows: tufts of one size and three near tones, the same everywhere."""
+    """Loop pile in rows: tufts of one size and three similar tones, the same everywhere."""
     tufts = 64
     y, x = np.mgrid[:size, :size].astype(np.float32) / size
     jitter = 0.12 * _band(rng, size, 40.0)

@@ -1,4 +1,4 @@
-"""What rooms are made of: wooden boards and floors, plaster, wallpaper, brick, tiles."""
+"""Interior materials: wooden boards and floors, plaster, wallpaper, brick, tiles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TONES = np.array(
 
 
 def _grain(rng: Rng, shape: tuple[int, int]) -> Field:
-    """Fibres and growth rings along x, unit deviation or so."""
+    """Fibres and growth rings along x, with about unit deviation."""
     h = shape[0]
     warp = noise(rng, shape, 1.8, 6.0)
     y = np.arange(h, dtype=np.float32)[:, None] / h

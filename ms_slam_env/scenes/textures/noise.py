@@ -24,9 +24,9 @@ _CLIP = 3.0
 
 @lru_cache(maxsize=48)
 def _base_field(height: int, width: int, exponent: float, stretch: float, index: int) -> Field:
-    """One field of zero mean and unit deviation; a few are made and then shifted and flipped."""
+    """A field of zero mean and unit deviation; a few are made, and then shifted and flipped."""
     rng = np.random.default_rng([height, width, int(100 * exponent), int(100 * stretch), index])
-    # In cycles per the image's longer side, so that a wide image has no wider features.
+    # In cycles per longer side of the image, so that a wide image has no wider features.
     longest = max(height, width)
     fy = fft.fftfreq(height)[:, None] * longest
     fx = fft.rfftfreq(width)[None, :] * longest * stretch
@@ -42,7 +42,7 @@ def _base_field(height: int, width: int, exponent: float, stretch: float, index:
 def noise(rng: Rng, shape: tuple[int, int], exponent: float = 1.0, stretch: float = 1.0) -> Field:
     """Tileable noise (h, w) of unit deviation with amplitude spectrum 1 / f^exponent.
 
-    ``stretch`` > 1 makes features that many times longer along the columns' direction x.
+    ``stretch`` > 1 makes features that many times longer along x, the direction of columns.
     """
     base = _base_field(*shape, exponent, stretch, int(rng.integers(_VARIANTS)))
     shift = (int(rng.integers(shape[0])), int(rng.integers(shape[1])))
@@ -51,7 +51,7 @@ def noise(rng: Rng, shape: tuple[int, int], exponent: float = 1.0, stretch: floa
 
 
 def shade(rgb: ArrayLike, *variations: tuple[float, Field]) -> Image:
-    """Colour(s) ``rgb`` (3,) or (h, w, 3) in [0, 255], made lighter and darker by the fields."""
+    """Lighten and darken the colour(s) ``rgb`` (3,) or (h, w, 3) in [0, 255] by the fields."""
     factor: Field = np.ones((), np.float32)
     for amount, field in variations:
         factor = factor + np.float32(amount) * field
@@ -62,7 +62,7 @@ def shade(rgb: ArrayLike, *variations: tuple[float, Field]) -> Image:
 def grain(
     rng: Rng, rgb: ArrayLike, shape: tuple[int, int], *variations: tuple[float, ...]
 ) -> Image:
-    """:func:`shade` by fields (h, w) of noise: the amount, exponent and stretch of each."""
+    """:func:`shade` with noise fields (h, w), given the amount, exponent and stretch of each."""
     return shade(rgb, *((amount, noise(rng, shape, *how)) for amount, *how in variations))
 
 
@@ -74,7 +74,7 @@ def write(
     rgb: ArrayLike,
     line: int = cv2.LINE_8,
 ) -> None:
-    """Write on an image (h, w, 3) in place; ``style`` is font, scale and thickness of OpenCV."""
+    """Write text on an image (h, w, 3) in place; ``style`` is OpenCV font, scale, thickness."""
     mask = np.zeros(image.shape[:2], np.uint8)  # text is drawn on 8 bits only
     cv2.putText(mask, text, at, style[0], style[1], 255, style[2], line)
     image[mask > 96] = rgb

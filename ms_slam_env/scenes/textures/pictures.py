@@ -1,4 +1,4 @@
-"""Pictures, and what is printed or lit: book spines, covers, pages, screens."""
+"""Pictures, prints and screens: paintings, book spines, covers, pages, displays."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _abstract(rng: Rng, h: int, w: int) -> _Canvas:
 
 
 def _portrait(rng: Rng, h: int, w: int) -> _Canvas:
-    """A head and shoulders before a dark ground."""
+    """Head and shoulders in front of a dark background."""
     ground = hsv(rng.random(), 0.35, rng.uniform(0.25, 0.6))
     image = _gradient(h, w, ground * 1.2, ground * 0.6)
     skin = hsv(rng.uniform(0.04, 0.08), rng.uniform(0.3, 0.55), rng.uniform(0.45, 0.92))
@@ -138,7 +138,7 @@ _LETTERS = "ABCDEFGHIKLMNOPRSTUVWY"
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX)
 
 SPINE_SLOTS = 16
-"""Spines side by side in one image of ``spines``."""
+"""Number of spines side by side in one image of ``spines``."""
 
 
 def _word(rng: Rng, low: int = 3, high: int = 10) -> str:
@@ -253,7 +253,7 @@ def screen(rng: Rng, h: int = 256, w: int = 512) -> Image:
 
 
 def television(rng: Rng) -> Image:
-    """A frame of some film: a picture with letter-box bars."""
+    """A film frame: a picture with letter-box bars."""
     image = picture(rng, 256, 512)
     image[:18], image[-18:] = 4, 4
     return image

@@ -1,6 +1,6 @@
-"""Ways of a camera through a scene, seeded or placed there.
+"""Camera paths through a scene: seeded ones, and recorded motions placed in the scene.
 
-Seeded ones are frozen dataclasses, a `CameraPath` each, which names of sequences can say.
+Seeded ones are frozen dataclasses derived from `CameraPath`, and can be part of sequence names.
 """
 
 from typing import TYPE_CHECKING

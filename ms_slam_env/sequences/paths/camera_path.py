@@ -1,4 +1,4 @@
-"""Ways of a camera through a scene: what each can do, and smooth curves through waypoints."""
+"""The interface of camera paths, and smooth curves through waypoints."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _TREMOR_RATES = (0.05, 0.09, 0.13)  # cycles per frame
 
 
 def unit(v: Float64) -> Float64:
-    """Direction (3,) of a vector (3,)."""
+    """Normalise a vector (3,)."""
     return v / np.linalg.norm(v)
 
 
@@ -29,12 +29,12 @@ def dense_path(
 
     Args:
         eyes: K waypoints (3,), metres.
-        targets: K points (3,) that the camera looks at from them.
-        is_closed: the path runs on from the last waypoint to the first, without a kink.
+        targets: K points (3,) that the camera looks at from the waypoints.
+        is_closed: whether the path continues smoothly from the last waypoint to the first.
     """
     from scipy.interpolate import CubicSpline
 
-    # The viewing direction, not the target, is interpolated: two targets may lie on both sides.
+    # Interpolates the viewing direction, not the target: two targets may be on opposite sides.
     directions = [unit(target - eye) for eye, target in zip(eyes, targets, strict=True)]
     if is_closed:
         eyes, directions = [*eyes, eyes[0]], [*directions, directions[0]]
@@ -57,21 +57,22 @@ def frame_times(path: Float64, speed_m: float, rot_rad: float) -> Float64:
 
 
 def resample(path: Float64, times: Float64, instants: NDArray, tremor: Float64) -> Float64:
-    """Poses (N, 4, 4) at ``instants`` (N,) on the scale of ``times`` (M,).
+    """Poses (N, 4, 4) at ``instants`` (N,), in the units of ``times`` (M,).
 
-    Positions are moved by ``tremor`` (N, 3) in metres, the point one metre ahead the other way.
+    Positions are shifted by ``tremor`` (N, 3) in metres, the point one metre ahead in the opposite
+    direction.
     """
     at = np.asarray(instants, dtype=np.float64)
     eyes = np.stack([np.interp(at, times, path[:, k, 3]) for k in range(3)], axis=1)
     aims = np.stack([np.interp(at, times, path[:, k, 2]) for k in range(3)], axis=1)
-    # Moving the eye twice as far as the point one metre ahead shakes the direction as well.
+    # Moving the eye differently from the point one metre ahead also shakes the direction.
     return np.stack(
         [look_at(eye + d, eye + aim - d) for eye, aim, d in zip(eyes, aims, tremor, strict=True)]
     )
 
 
 def hand_tremor(frames: int, rng: np.random.Generator) -> Float64:
-    """Tremor of the hand (frames, 3) in metres: three sines an axis."""
+    """Hand tremor (frames, 3) in metres: three sines per axis."""
     t = np.arange(frames)[:, None]
     total = np.zeros((frames, 3))
     for rate in _TREMOR_RATES:
@@ -82,19 +83,19 @@ def hand_tremor(frames: int, rng: np.random.Generator) -> Float64:
 
 
 class CameraPath(ABC):
-    """A way of a camera through a scene: a frozen dataclass of how it is carried."""
+    """A camera path through a scene: a frozen dataclass of its parameters."""
 
     @abstractmethod
     def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
         """Times (N,) in seconds and poses T_world_camera (N, 4, 4).
 
-        The same scene and seed give the same way.
+        The same scene and seed give the same path.
 
         Raises:
-            InputError: no free way, or one that the scene does not permit; of a loop that is too
-                short the message says how many frames the shortest one needs.
+            InputError: no free path, or one that the scene does not permit; if a loop is too short,
+                the message says how many frames the shortest one needs.
         """
 
     def poses(self, scene: Scene, seed: int) -> Float64:
-        """The poses of `motion` alone."""
+        """Only the poses of `motion`."""
         return self.motion(scene, seed)[1]

@@ -1,4 +1,4 @@
-"""A hand-held camera at a stated pace: seeded, smooth, open or closed."""
+"""Hand-held camera paths at a given pace: seeded, smooth, open or closed."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from ms_slam_env.sequences.paths.camera_path import (
 from ms_slam_env.sequences.paths.wandering import RADIUS_M, Gaze, free_path
 
 _SAMPLES = 2000
-_SPACING_M = 0.25  # between places of the roadmap
-_REACH_M = 0.7  # between places that are joined
-_HEIGHT_M = 0.25  # places lie so far above or below the start
-_DETOUR = 4.0  # a way that was taken already counts as so many times its length
-_FEWEST_WAYPOINTS = 12  # 30 degrees of the turn between two of them
-_SWEEP_RAD = np.radians(45.0)  # off the evenly turning direction
-_TURN_RAD = np.radians(70.0)  # between the viewing directions of two waypoints
+_SPACING_M = 0.25  # between nodes of the roadmap
+_REACH_M = 0.7  # largest length of an edge
+_HEIGHT_M = 0.25  # largest height difference of nodes from the start
+_DETOUR = 4.0  # cost factor of edges already used
+_FEWEST_WAYPOINTS = 12  # with 30 degrees of the turn between two of them
+_SWEEP_RAD = np.radians(45.0)  # largest deviation from the uniformly turning direction
+_TURN_RAD = np.radians(70.0)  # largest angle between the viewing directions of two waypoints
 _FARTHEST_M = 4.5
-_DESTINATIONS = 120  # tried for one start
+_DESTINATIONS = 120  # tried per start
 _NEAR_M = 0.6  # destinations nearer than this are tried last
 _STARTS = 5
 _CLOSED_PATHS = 4  # to choose among, per start
@@ -42,9 +42,9 @@ _PACE_PERIODS_S = (2.3, 5.1, 11.7)
 def _roadmap(
     scene: Scene, start: Float64, radius_m: float, rng: np.random.Generator
 ) -> tuple[Float64, Float64]:
-    """Free places (N, 3), and the lengths (N, N) of free straight ways between near ones, 0 = none.
+    """Random free nodes (N, 3), and lengths (N, N) of free straight edges between them, 0 = none.
 
-    The places are random, around the height of ``start`` (3,), which is the first of them.
+    The nodes are near the height of ``start`` (3,), which is the first.
     """
     from scipy.spatial import cKDTree
 
@@ -64,7 +64,7 @@ def _roadmap(
 
 
 def _shortest(lengths: Float64, start: int, end: int) -> list[int]:
-    """Places from ``start`` to ``end``, both included; empty if there is no way."""
+    """Nodes on the shortest route from ``start`` to ``end``, both included; empty if none."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
 
@@ -78,7 +78,7 @@ def _shortest(lengths: Float64, start: int, end: int) -> list[int]:
 
 
 def _round_trip(places: Float64, lengths: Float64, destination: int) -> list[Float64]:
-    """Waypoints to a place and back, by another way where the detour is bearable."""
+    """Waypoints to a node and back, on another route if the detour is acceptable."""
     from scipy.spatial import cKDTree
 
     out = _shortest(lengths, 0, destination)
@@ -93,7 +93,7 @@ def _round_trip(places: Float64, lengths: Float64, destination: int) -> list[Flo
         costs[:, is_near] *= _DETOUR
     back = _shortest(costs, destination, 0)
     eyes = [places[i] for i in [*out, *back[1:-1]]]
-    while len(eyes) < _FEWEST_WAYPOINTS:  # halves every way, so that the turn has its steps
+    while len(eyes) < _FEWEST_WAYPOINTS:  # halves every edge, for enough steps of the turn
         after = [*eyes[1:], eyes[0]]
         eyes = [p for a, b in zip(eyes, after, strict=True) for p in (a, 0.5 * (a + b))]
     return eyes
@@ -102,7 +102,7 @@ def _round_trip(places: Float64, lengths: Float64, destination: int) -> list[Flo
 def _sweep(
     eyes: list[Float64], heading: Float64, gaze: Gaze, rng: np.random.Generator
 ) -> list[Float64] | None:
-    """What to look at from each waypoint while turning once around; None if something fails."""
+    """Targets to look at from each waypoint while turning once around; None if one fails."""
     side = rng.choice([-1.0, 1.0])
     targets: list[Float64] = []
     for k, eye in enumerate(eyes):
@@ -120,9 +120,9 @@ def _sweep(
 def closed_paths(scene: Scene, rng: np.random.Generator, radius_m: float) -> Iterator[Float64]:
     """Dense closed paths (M, 4, 4) from one random start: the first pose equals the last.
 
-    Each leads to another place and turns the camera once around on the way, so what the end sees
-    was out of sight for most of it. ``radius_m`` is the free space around the waypoints; the
-    splines between them keep half of it.
+    Each leads to another place and turns the camera once around, so what is seen at the end was out
+    of view most of the time. ``radius_m`` is the clearance of the waypoints; the splines between
+    them keep half of it.
     """
     start = scene.sample_start(rng)
     places, lengths = _roadmap(scene, start[:3, 3], radius_m, rng)
@@ -143,22 +143,22 @@ def closed_paths(scene: Scene, rng: np.random.Generator, radius_m: float) -> Ite
 
 @dataclass(frozen=True)
 class HandheldPath(Checked, CameraPath):
-    """How a camera is carried through a scene.
+    """A hand-held camera path.
 
-    At every instant it moves at the pace that whichever of the two speeds permits that is reached
-    first: along straights the first, in turns the second. The pace varies slowly about its mean.
+    The pace is always limited by one of the two speeds: the first on straight sections, the second
+    in turns. It varies slowly about its mean.
 
     Attributes:
         frames: number of poses.
-        rate_hz: of the frames.
+        rate_hz: frame rate.
         speed_m_s: mean speed of the camera where it does not turn.
-        turn_deg_s: mean speed of rotation where it turns.
-        variation: the pace varies by this share, up and down.
+        turn_deg_s: mean angular speed where it turns.
+        variation: share by which the pace varies up and down.
         max_step_m: largest translation from frame to frame, without the tremor.
         max_turn_deg: largest rotation from frame to frame, without the tremor.
-        loop: whether it returns to the start, turning once around on the way and going back by
-            another way if the scene has one; the path is then shared out evenly over the frames,
-            in several rounds if there are many, and slower than the pace where it must be.
+        loop: whether it returns to the start, turning once around and going back on another route
+            if the scene has one. The path is then distributed evenly over the frames, in several
+            rounds if there are many, and slower than the pace if necessary.
     """
 
     frames: int = bounded(300, 2, 1_000_000)
@@ -206,7 +206,7 @@ class HandheldPath(Checked, CameraPath):
     def _closed(
         self, scene: Scene, length: float, rng: np.random.Generator, step_m: float, rot_rad: float
     ) -> tuple[Float64, Float64]:
-        """The longest closed path that takes at most ``length`` frames at the mean pace."""
+        """Find the longest closed path that takes at most ``length`` frames at the mean pace."""
         where = f"scene {scene.name!r}, seed {scene.seed}"
         shortest = 2 * np.pi / rot_rad  # the turn alone
         lengths: list[float] = []

@@ -1,4 +1,4 @@
-"""Hand-held cameras whose pace changes on the way: calm and in haste, still and in a hurry."""
+"""Hand-held camera paths with changing pace: slow and fast sections."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from ms_slam_env.sequences.paths.wandering import free_path
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 PACES = (0.1, 1.0, 4.0)
-"""Of an `UnevenPath`: nearly still, walking, in a hurry; multiples of its mean pace."""
+"""Paces of an `UnevenPath`: nearly still, walking, hurrying; multiples of its middle pace."""
 
 _RATE_HZ = 30.0
 _SEGMENT_S = (0.8, 2.0)  # shortest and longest time at one pace
-_EASING_S = 0.25  # in which one pace gives way to the next
+_EASING_S = 0.25  # duration of the transition between paces
 _RAMP = 6  # frames over which the pace of motion segments changes
 
 
 @dataclass(frozen=True)
 class UnevenPath(Checked, CameraPath):
-    """A camera carried at 0.5 m/s or 30 deg/s, now and then ten times slower or four times faster.
+    """A hand-held path at 0.5 m/s or 30 deg/s, at times ten times slower or four times faster.
 
     Attributes:
-        frames: number of poses, 30 a second.
-        speed_m_s: of the middle pace where it does not turn.
-        turn_deg_s: of the middle pace where it turns.
+        frames: number of poses, 30 per second.
+        speed_m_s: speed at the middle pace where it does not turn.
+        turn_deg_s: angular speed at the middle pace where it turns.
     """
 
     frames: int = bounded(300, 30, 100_000)
@@ -40,7 +40,7 @@ class UnevenPath(Checked, CameraPath):
     turn_deg_s: float = bounded(30.0, 1e-2, 1e4)
 
     def paces(self, seed: int) -> Float64:
-        """Pace (frames,) at each frame: segments of 0.8 to 2 s, every pace once a round."""
+        """Pace (frames,) at each frame: segments of 0.8 to 2 s, each pace once per round."""
         rng = np.random.default_rng([seed, 79])
         rates: list[float] = []
         while len(rates) < self.frames:
@@ -62,16 +62,16 @@ class UnevenPath(Checked, CameraPath):
 
 @dataclass(frozen=True)
 class MotionSegments(Checked, CameraPath):
-    """A hand-held path, carried calmly and, now and then, in haste.
+    """A hand-held path with alternating calm and violent segments.
 
     Attributes:
         frames: length of the sequence.
-        rate_hz: of the frames.
-        speed_m_s: mean speed of the calm camera where it does not turn.
-        turn_deg_s: mean speed of its rotation where it turns.
-        quiet: frames of a calm segment; the sequence begins with one.
-        violent: frames of a hasty segment after it.
-        factor: how many times faster the same path is travelled in haste.
+        rate_hz: frame rate.
+        speed_m_s: mean speed in calm segments where the camera does not turn.
+        turn_deg_s: mean angular speed in calm segments where it turns.
+        quiet: frames of a calm segment; the sequence starts with one.
+        violent: frames of the violent segment that follows.
+        factor: speed factor in violent segments, on the same path.
     """
 
     frames: int = bounded(240, 4, 100_000)
@@ -83,14 +83,14 @@ class MotionSegments(Checked, CameraPath):
     factor: float = bounded(20.0, 1, 1000)
 
     def pace(self) -> Float64:
-        """(frames,) times faster than calm, with smooth changes."""
+        """Speed factor (frames,) relative to calm, with smooth changes."""
         place = np.arange(self.frames) % (self.quiet + self.violent)
         into = np.minimum(place - self.quiet + 1, self.quiet + self.violent - place) / _RAMP
         share = 0.5 * (1.0 - np.cos(np.pi * np.clip(into, 0.0, 1.0)))
         return 1.0 + (self.factor - 1.0) * share
 
     def is_violent(self) -> NDArray[np.bool_]:
-        """(frames,) whether the pace is nearer to that of haste."""
+        """Whether (frames,) the pace is closer to violent than to calm."""
         return self.pace() > 0.5 * (1.0 + self.factor)
 
     def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:

@@ -1,4 +1,4 @@
-"""A recorded camera motion moved into a scene."""
+"""Places a recorded camera motion in a scene."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from ms_slam_env.scenes.scene import Scene
 SCALES = tuple(round(1.0 - 0.05 * k, 2) for k in range(19))
 """Scales tried, from the largest to the smallest."""
 
-_RADIUS_M = 0.15  # free space kept around the camera
-_PLACES = 400  # tried at each scale
-_HEIGHTS = 8  # of start poses, one of which the middle of the motion has
-_FIRST_CHECKED = 40  # poses that rule out most places
+_RADIUS_M = 0.15  # least clearance of the camera
+_PLACES = 400  # positions tried per scale
+_HEIGHTS = 8  # candidate heights, from start poses, for the middle of the motion
+_FIRST_CHECKED = 40  # poses checked first, which rule out most positions
 
 
 @dataclass(frozen=True)
 class Placement:
-    """A motion in a scene.
+    """A motion placed in a scene.
 
     Attributes:
         poses: (N, 4, 4) T_world_camera.
         scale: factor on the translations.
-        T_scene_recording: (4, 4) where the recording's world, scaled, lies in the scene.
+        T_scene_recording: (4, 4) pose of the recording's scaled world in the scene.
     """
 
     poses: Float64
@@ -44,24 +44,24 @@ def upright(poses: Float64) -> Float64:
     up_axis[axis] = np.sign(up[axis])
     if axis == 2:
         return np.eye(3) if up_axis[2] > 0 else np.diag([1.0, -1.0, -1.0])
-    x = np.cross(up_axis, [0.0, 0.0, 1.0])  # any right-handed frame whose z is up will do
+    x = np.cross(up_axis, [0.0, 0.0, 1.0])  # any right-handed frame with z up will do
     return np.stack([x, np.cross(up_axis, x), up_axis])
 
 
 def place_trajectory(
     scene: Scene, poses: ArrayLike, seed: int = 0, scale: float | None = None
 ) -> Placement:
-    """Turn a motion upright and put it into free space of a scene, as large as fits.
+    """Turn a motion upright and place it in free space of a scene, as large as fits.
 
     Args:
-        scene: where to.
+        scene: the scene.
         poses: (N, 4, 4) T_world_camera; the world axis nearest to the cameras' up becomes z.
-        seed: of the places tried.
+        seed: seed of the positions tried.
         scale: factor on the translations; by default the largest of ``SCALES`` that fits.
 
     Raises:
-        InputError: no pose, a pose that is no rigid motion, a scale that is not positive, or no
-            place where the motion fits.
+        InputError: no pose, a pose that is not a rigid motion, a scale that is not positive, or no
+            position where the motion fits.
     """
     given = np.asarray(poses, dtype=np.float64)
     if given.ndim != 3 or len(given) == 0:

@@ -1,4 +1,4 @@
-"""A camera carried along streets and aisles, from one named place of a scene to the next."""
+"""Camera paths along streets and aisles, through named places of a scene."""
 
 from __future__ import annotations
 
@@ -23,33 +23,32 @@ from ms_slam_env.sequences.paths.wandering import RADIUS_M
 
 _SAMPLE_M = 0.1
 _CORNER_M = 0.9  # width of the filter that rounds corners
-_AHEAD_M = 2.5  # the camera looks at where it will be
-_OF_PASSAGE = (0.25, 1.2, 0.06)  # the most of these two, and of straying, per width of a passage
-_DOWN_DEG = 6.0  # mean angle of the view below the horizon, of somebody who looks where he goes
-_SWAY_DEG = 8.0  # how far the view swings to the sides
-_STRAY_M = 0.25  # how far the way strays to the sides: a second pass is not the first again
-_WAVES_M = (5.3, 11.9, 27.1)  # lengths of the sway along the way
+_AHEAD_M = 2.5  # distance along the path that the camera looks ahead
+_OF_PASSAGE = (0.25, 1.2, 0.06)  # limits of these two and of straying, per width of a passage
+_DOWN_DEG = 6.0  # mean angle of the view below the horizon, looking where one walks
+_SWAY_DEG = 8.0  # amplitude of the view's sideways swing
+_STRAY_M = 0.25  # sideways deviation of the path, so that a second pass differs from the first
+_WAVES_M = (5.3, 11.9, 27.1)  # wavelengths of the sway along the path
 _PACE_PERIODS = (23.0, 51.0, 117.0)  # in frames
 _ATTEMPTS = 20
 
 
 @dataclass(frozen=True)
 class RoutePath(Checked, CameraPath):
-    """A way along named places of a scene.
+    """A camera path along named places of a scene.
 
-    At every instant the camera moves at the pace that whichever of the two speeds permits that is
-    reached first: along streets the first, around corners the second. It looks where it goes, a
-    little down, swaying to the sides, and keeps no perfectly straight line: where the way leads
-    along a street for the second time it runs a little beside the first. Through passages as narrow
-    as doors it keeps to the middle.
+    The pace is always limited by one of the two speeds: the first along streets, the second around
+    corners. The camera looks ahead and slightly down, swaying sideways. It does not keep a
+    perfectly straight line: a second pass along a street runs slightly beside the first. Through
+    passages as narrow as doors it stays in the middle.
 
     Attributes:
-        via: names of places (``Scene.places``), or ``A-B`` for the middle between two.
-        rate_hz: of the frames.
+        via: names of places (``Scene.places``), or ``A-B`` for the midpoint of two.
+        rate_hz: frame rate.
         speed_m_s: mean speed of the camera where it does not turn.
-        turn_deg_s: mean speed of rotation where it turns.
-        variation: the pace varies by this share, up and down.
-        height_m: of the camera above the ground.
+        turn_deg_s: mean angular speed where it turns.
+        variation: share by which the pace varies up and down.
+        height_m: height of the camera above the ground.
 
     Raises:
         InputError: a value out of range, or fewer than two places.
@@ -69,14 +68,14 @@ class RoutePath(Checked, CameraPath):
             raise InputError(f"RoutePath.via = {self.via!r} must name at least two places")
 
     def with_frames_scaled(self, scale: float) -> RoutePath:
-        """The same way in ``scale`` times as many frames, so that much slower."""
+        """The same path in ``scale`` times as many frames, at correspondingly lower speed."""
         return replace(self, speed_m_s=self.speed_m_s / scale, turn_deg_s=self.turn_deg_s / scale)
 
     def motion(self, scene: Scene, seed: int) -> tuple[Float64, Float64]:
         """Times (N,) in seconds and poses T_world_camera (N, 4, 4).
 
         Raises:
-            InputError: a scene without such places, or a way that is not free.
+            InputError: a scene without these places, or a path that is not free.
         """
         corners = _corners(scene, self.via)
         rng = np.random.default_rng([seed, 80])
@@ -90,7 +89,7 @@ class RoutePath(Checked, CameraPath):
         )
 
     def _dense(self, corners: Float64, passage_m: float, rng: np.random.Generator) -> Float64:
-        """Poses (M, 4, 4) every ``_SAMPLE_M``, speeds left aside."""
+        """Poses (M, 4, 4) every ``_SAMPLE_M``, without timing."""
         most = (_CORNER_M, _AHEAD_M, _STRAY_M)
         corner_m, ahead_m, stray_m = map(min, most, np.multiply(_OF_PASSAGE, passage_m).tolist())
         line = _rounded(corners, corner_m)
@@ -138,14 +137,14 @@ def _corners(scene: Scene, via: tuple[str, ...]) -> Float64:
 
 
 def _rounded(corners: Float64, width_m: float) -> Float64:
-    """Points (M, 3) every ``_SAMPLE_M`` or so along the corners (K, 3), which are rounded."""
+    """Points (M, 3) about every ``_SAMPLE_M`` along the corners (K, 3), which are rounded."""
     from scipy.ndimage import gaussian_filter1d
 
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     at = np.concatenate([[0.0], np.cumsum(lengths)])
     arc = np.arange(0.0, at[-1], _SAMPLE_M)
     line = np.stack([np.interp(arc, at, corners[:, k]) for k in range(3)], -1)
-    # Run straight on beyond both ends, which the filter would pull inwards.
+    # Extend both ends straight, because the filter would pull them inwards.
     margin = round(4 * width_m / _SAMPLE_M)
     steps = _SAMPLE_M * np.arange(1, margin + 1)[:, None]
     before = line[0] - steps[::-1] * unit(corners[1] - corners[0])
@@ -155,6 +154,6 @@ def _rounded(corners: Float64, width_m: float) -> Float64:
 
 
 def _wave(arc: Float64, rng: np.random.Generator) -> Float64:
-    """A smooth function (M,) of the way, within [-1, 1]."""
+    """A smooth function (M,) of the arc length, within [-1, 1]."""
     phase = rng.uniform(0, 2 * np.pi, len(_WAVES_M))
     return np.sin(2 * np.pi * arc[:, None] / np.array(_WAVES_M) + phase).mean(axis=1)

@@ -1,4 +1,4 @@
-"""A hand-held camera that wanders through a scene's free space, looking at what it sees."""
+"""Hand-held camera paths that wander through free space, looking at visible surfaces."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _NEAREST_M = 0.6
 _MAX_SLOPE = 0.8  # sine of the angle above or below the horizon
 _LOOKS = 10
 RADIUS_M = 0.25
-"""Free space kept around the camera."""
+"""Least clearance of the camera."""
 _HOP_M = (0.35, 0.7)  # distance between waypoints
-_MAX_TURN_RAD = np.radians(50.0)  # between the viewing directions of two waypoints
+_MAX_TURN_RAD = np.radians(50.0)  # largest angle between the viewing directions of two waypoints
 _ATTEMPTS = 200
 _LEAP = 0.8
 
 
 class Gaze:
-    """Chooses visible surface points of a scene at a distance that a depth camera sees well."""
+    """Chooses visible surface points of a scene at a distance suitable for a depth camera."""
 
     def __init__(self, scene: Scene) -> None:
         """Sample the scene's surface."""
@@ -46,13 +46,14 @@ class Gaze:
         rng: np.random.Generator,
         farthest_m: float | None = None,
     ) -> Float64 | None:
-        """A surface point (3,) that ``eye`` (3,) sees; None if there is none.
+        """Choose a surface point (3,) visible from ``eye`` (3,); None if there is none.
 
         Args:
             eye: position of the camera.
-            cones: unit vectors (3,) and the angles in radians within which it must lie of each.
+            cones: unit vectors (3,), and the angle in radians within which the point must be of
+                each.
             rng: draws among the suitable points.
-            farthest_m: largest distance from the camera; by default that of the scene.
+            farthest_m: largest distance from the camera; the scene's by default.
         """
         farthest_m = self.scene.gaze_m if farthest_m is None else farthest_m
         offsets = self.surface - eye
@@ -64,7 +65,7 @@ class Gaze:
         suitable = np.flatnonzero(is_suitable)
         if not len(suitable):
             return None
-        # Every object is as likely as a whole wall: people look at things.
+        # An object is as likely as a whole wall, because people look at things.
         weights = 1.0 / np.bincount(self.labels[suitable])[self.labels[suitable]]
         count = min(_LOOKS, len(suitable))
         drawn = rng.choice(suitable, count, replace=False, p=weights / weights.sum())
@@ -76,7 +77,7 @@ class Gaze:
 
 
 class Wanderer:
-    """Draws waypoints and what to look at from each."""
+    """Draws waypoints and a target to look at from each."""
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene = scene
@@ -88,7 +89,7 @@ class Wanderer:
         self.targets = [start[:3, 3] + 1.2 * start[:3, 2]]
 
     def hop(self) -> None:
-        """Append one waypoint that the last one sees, and a visible surface point ahead."""
+        """Append a waypoint visible from the last one, and a visible surface point ahead."""
         for _ in range(_ATTEMPTS):
             step = self.rng.normal(size=3) * (1.0, 1.0, 0.35)
             eye = self.eyes[-1] + unit(step) * self.rng.uniform(*_HOP_M)
@@ -110,15 +111,15 @@ class Wanderer:
 def handheld_trajectory(
     scene: Scene, frames: int, seed: int, speed_m: float = 0.015, rot_deg: float = 1.0
 ) -> Float64:
-    """Poses T_world_camera (frames, 4, 4) of a camera carried through free space.
+    """Poses T_world_camera (frames, 4, 4) of a hand-held camera in free space.
 
     Splines through random free waypoints; at each the camera looks at a visible surface. It moves
     as fast as the two limits permit, with a tremor of about 2 mm on top.
 
     Args:
-        scene: where to move.
+        scene: the scene.
         frames: number of poses.
-        seed: of the waypoints.
+        seed: seed of the waypoints.
         speed_m: largest translation from frame to frame, without the tremor.
         rot_deg: largest rotation from frame to frame, without the tremor.
 
@@ -146,10 +147,10 @@ def _wander(
     rot_rad: float,
     leap: float = 0.0,
 ) -> tuple[Float64, Float64]:
-    """A dense path and its frame times, up to ``length`` frames or a little more.
+    """A dense path and its frame times, of at least ``length`` frames.
 
-    ``leap`` is the share of the hops that seem to be missing that is taken before the path is drawn
-    anew; 0 = one hop, which takes time in the square of the length.
+    ``leap`` is the share of the estimated missing hops to add before recomputing the path; 0 = one
+    hop, which takes time quadratic in the length.
     """
     wanderer = Wanderer(scene, rng)
     wanderer.hop()
@@ -165,7 +166,7 @@ def _wander(
 
 
 def _is_free(scene: Scene, poses: Float64) -> bool:
-    """Whether the path keeps clear; splines swing out, so the segments' clearance is not enough."""
+    """Whether the path is clear; splines swing out, so checking the segments is not enough."""
     return bool(scene.clearance(poses[:, :3, 3]).min() > 0.5 * RADIUS_M)
 
 
@@ -175,7 +176,7 @@ def free_path(
     """Dense poses (M, 4, 4) of an open path and the frame numbers (M,) at which they are reached.
 
     Args:
-        scene: where.
+        scene: the scene.
         length: number of the last frame that it must reach.
         rng: draws the waypoints.
         speed_m: largest translation from frame to frame.
@@ -193,10 +194,10 @@ def free_path(
 
 @dataclass(frozen=True)
 class WanderingPath(Checked, CameraPath):
-    """A hand-held camera that is always as fast as two limits permit: ``handheld_trajectory``.
+    """A hand-held path that is always as fast as two limits permit: ``handheld_trajectory``.
 
     Attributes:
-        frames: number of poses, 30 a second.
+        frames: number of poses, 30 per second.
         step_m: largest translation from frame to frame, without the tremor.
         step_deg: largest rotation from frame to frame, without the tremor.
     """

@@ -1,6 +1,6 @@
 """Imperfections of cameras and recordings, each with a strength, by name.
 
-Stochastic ones have a ``seed`` of their own beside the sequence's.
+Stochastic ones have their own ``seed`` in addition to the sequence's.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ PERTURBATIONS: dict[str, str] = {
     "fast-motion": f"{_OWN}.optics:FastMotion",
     "illumination": f"{_OWN}.illumination:Illumination",
 }
-"""Name to where its class is, which is imported where it is made."""
+"""Location of each perturbation's class, which is imported when made."""
 
 POINT = ExtensionPoint("perturbation", "ms_slam_env.perturbations", Perturbation, own=PERTURBATIONS)
-"""Where perturbations are found."""
+"""Finds perturbations."""
 
 
 def make_perturbation(
     name: str | type[Perturbation], options: Mapping[str, Any] | None = None
 ) -> Perturbation:
-    """Make a perturbation; options that are left out keep their default strength.
+    """Make a perturbation; omitted options keep their default strength.
 
     Raises:
         InputError: unknown name or option, or a value out of range.

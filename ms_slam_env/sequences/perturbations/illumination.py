@@ -21,28 +21,28 @@ from ms_slam_env.sequences.perturbations.perturbation import LightPerturbation, 
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 _BULB = Shape("box", (), radius_m=0.15, length_m=0.1, width_m=0.1, height_m=0.05, depth_m=0.05)
-_NEAREST_M = 0.2  # closer the light of the lamp grows no more
-_DIMMEST = 1e-3  # of the typical light: less is not followed
+_NEAREST_M = 0.2  # the lamp's light does not increase below this distance
+_DIMMEST = 1e-3  # share of the typical light; less is ignored
 _SHADOW_END = 0.999
 _TRIES = 2000
-_SHORTEST_M = 0.3  # between the camera and the lamp
+_SHORTEST_M = 0.3  # least distance between camera and lamp
 
 
 @dataclass(frozen=True)
 class Illumination(Checked, LightPerturbation):
-    """The scene's lights go down and up again, and a small lamp wanders about and casts shadows.
+    """Dims the scene's lights periodically, and adds a small moving lamp that casts shadows.
 
-    Both change linear light before noise and the sRGB curve; depth does not change. The lamp goes
-    there and back in free space, as a box of ``moving-objects`` does. Its shadows are those of the
-    scene on the scene, sampled at the corners of the triangles; it is too small to be seen.
+    Both change linear light before noise and the sRGB curve; depth does not change. The lamp moves
+    back and forth in free space, like a box of ``moving-objects``. Its shadows are cast by the
+    scene on itself, sampled at triangle corners; the lamp itself is too small to be seen.
 
     Attributes:
-        dim: share of the scene's own light that is gone when it is darkest; 0 = off.
-        period_s: from full light to full light.
-        lamp: what the lamp adds to a surface that faces it from 1 m, in units of the median light
-            in the scene; 0 = off.
-        speed_m_s: of the lamp.
-        seed: of the lamp's way, beside the sequence's.
+        dim: share of the scene's own light that is missing at the darkest time; 0 = off.
+        period_s: time from full light to full light.
+        lamp: light that the lamp adds to a surface facing it at 1 m, in units of the scene's median
+            light; 0 = off.
+        speed_m_s: speed of the lamp.
+        seed: seed of the lamp's route, in addition to the sequence's.
     """
 
     dim: float = bounded(0.6, 0.0, 0.98)
@@ -57,7 +57,7 @@ class Illumination(Checked, LightPerturbation):
         """See the base class.
 
         Raises:
-            InputError: no free way for the lamp.
+            InputError: no free route for the lamp.
         """
         if self.dim == 0 and self.lamp == 0:
             return None
@@ -69,7 +69,7 @@ class Illumination(Checked, LightPerturbation):
     def _way(
         self, scene: Scene, camera: PoseInterpolation, intrinsics: Intrinsics, seed: int
     ) -> Track:
-        """The first free way not too near to the camera, in its view or, failing that, anywhere."""
+        """The first free route not too near the camera, in its view if possible."""
         rng = random_numbers(seed, self.seed, name="illumination")
         poses = camera.poses
         eyes = poses[:, :3, 3]
@@ -86,10 +86,10 @@ class Illumination(Checked, LightPerturbation):
 
 
 class WanderingLamp:
-    """A point light on its way."""
+    """A moving point light."""
 
     def __init__(self, scene: Scene, track: Track, strength: float) -> None:
-        """Let a lamp as strong as ``strength`` times the median light of the scene go."""
+        """Start a lamp with ``strength`` times the scene's median light."""
         mesh = scene.mesh
         self._track = track
         self._rays = RayCaster(mesh.vertices, mesh.faces)
@@ -99,7 +99,7 @@ class WanderingLamp:
         self._intensity = strength * self._typical
 
     def position(self, time_s: float) -> Float64:
-        """Where (3,) it is."""
+        """Position (3,) at a time."""
         return self._track.at(time_s)[0]
 
     def light(self, points: Float64, normals: Float64, time_s: float) -> Float64:
@@ -116,12 +116,12 @@ class WanderingLamp:
 
 
 class LampsAndDimmer(ChangingLight):
-    """The scene's light times a level that goes down and up, and a lamp's beside it."""
+    """The scene's light, periodically dimmed, plus a lamp's."""
 
     def __init__(
         self, dim: float, period_s: float, start_s: float, lamp: WanderingLamp | None
     ) -> None:
-        """Begin at ``start_s`` in full light."""
+        """Start at ``start_s`` with full light."""
         self._dim, self._period, self._start, self._lamp = dim, period_s, start_s, lamp
         self.is_added = lamp is not None
 

@@ -1,4 +1,4 @@
-"""What is in the images: holes and steps of depth, changing exposure, darkness."""
+"""Image perturbations: holes and steps in depth, changing exposure, black frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ms_slam_env.sequences.perturbations.perturbation import (
 )
 
 _ATTEMPTS = 10_000
-_EDGE_JUMP = 0.05  # of a depth edge: neighbours differ by more than this share of the nearer one
+_EDGE_JUMP = 0.05  # depth edge: neighbours differ by more than this share of the nearer one
 
 
 _NATIVE_WIDTH = 640
@@ -27,14 +27,14 @@ _NATIVE_WIDTH = 640
 
 @dataclass(frozen=True)
 class DepthDropout(Checked, ImagePerturbation):
-    """Holes in patches, along depth edges, and of single pixels; every frame's are its own.
+    """Holes in depth: patches, along edges, and single pixels, drawn for every frame.
 
     Attributes:
-        patches: share of the image that elliptic patches cover, at least; 0 = none.
+        patches: least share of the image covered by elliptic patches; 0 = none.
         patch_size: mean diameter of a patch as a share of the image's width.
         edge_px: pixels on either side of a depth edge that have no reading; 0 = none.
         pixels: probability that a single pixel has no reading.
-        seed: of the holes, beside the sequence's.
+        seed: seed of the holes, in addition to the sequence's.
     """
 
     patches: float = bounded(0.1, 0.0, 0.95)
@@ -49,7 +49,7 @@ class DepthDropout(Checked, ImagePerturbation):
         mask = self._patches(depth.shape, rng)
         if self.edge_px:
             distance = ndimage.distance_transform_cdt(~self._edges(depth), "taxicab")
-            mask |= (distance >= 0) & (distance < self.edge_px)  # -1 without any edge
+            mask |= (distance >= 0) & (distance < self.edge_px)  # -1 if there is no edge
         return mask | (rng.random(depth.shape) < self.pixels)
 
     def _patches(self, shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -72,7 +72,7 @@ class DepthDropout(Checked, ImagePerturbation):
                 other = np.roll(depth, turn, axis)
                 nearer = np.minimum(depth, other)
                 jumps = (nearer > 0) & (np.abs(depth - other) > nearer * _EDGE_JUMP)
-                jumps[(slice(None),) * axis + (0 if turn == 1 else -1,)] = False  # rolled around
+                jumps[(slice(None),) * axis + (0 if turn == 1 else -1,)] = False  # wrapped around
                 edges |= jumps
         return edges
 
@@ -84,7 +84,7 @@ class DepthDropout(Checked, ImagePerturbation):
 
 @dataclass(frozen=True)
 class DepthQuantisation(Checked, ImagePerturbation):
-    """Disparity d = f b / z of the 640 pixels wide sensor, rounded to whole steps.
+    """Rounds the disparity d = f b / z of the 640 pixels wide sensor to whole steps.
 
     Source: Khoshelham and Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor
     Mapping Applications", Sensors 2012: baseline 7.5 cm, steps of an eighth of a pixel; the
@@ -104,25 +104,25 @@ class DepthQuantisation(Checked, ImagePerturbation):
         if self.step_px == 0:
             return frame
         native_fx = moment.intrinsics.fx * _NATIVE_WIDTH / moment.intrinsics.width
-        unit = native_fx * self.baseline_m / self.step_px  # depth times disparity in steps
+        unit = native_fx * self.baseline_m / self.step_px  # product of depth and disparity in steps
         is_read = frame.depth > 0
         steps = np.rint(unit / np.where(is_read, frame.depth, 1.0).astype(np.float64))
         depth = np.where(is_read & (steps >= 1), unit / np.maximum(steps, 1), 0.0)
         return dataclasses.replace(frame, depth=depth.astype(np.float32))
 
 
-_DARK = 1.0  # mean intensity below which brightness is not compensated further
+_DARK = 1.0  # least mean intensity that compensation assumes
 
 
 class GainAndBias(ImagePerturbation):
-    """Colour values c become round(gain * c + bias), held within [0, 255].
+    """Changes colour values c to round(gain * c + bias), clipped to [0, 255].
 
-    The values are as stored (sRGB), so a gain g is a change of the light by about g^2.2.
+    The values are as stored (sRGB), so a gain g changes the light by about g^2.2.
     """
 
     @abstractmethod
     def gain_and_bias(self, moment: Moment) -> tuple[float, float]:
-        """Of a frame; the bias in steps of 255."""
+        """Gain and bias of a frame; the bias is in steps of 255."""
 
     def apply(self, frame: RGBDFrame, moment: Moment) -> RGBDFrame:
         """See the base class."""
@@ -138,8 +138,8 @@ class AutoExposure(Checked, GainAndBias):
     log g(k) = (1 - rate) log g(k - 1) + rate * strength * log(mean(0) / mean(k)), g(0) = 1.
 
     Attributes:
-        strength: share of a change of brightness that is compensated; 0 = off, 1 = all of it.
-        rate: share of the remaining error that is corrected at each frame.
+        strength: share of a brightness change that is compensated; 0 = off, 1 = all.
+        rate: share of the remaining error corrected at each frame.
         largest: gain stays within [1 / largest, largest].
     """
 
@@ -159,11 +159,11 @@ class AutoExposure(Checked, GainAndBias):
 
 @dataclass(frozen=True)
 class ExposureRamp(Checked, GainAndBias):
-    """Gain and bias of the colour values, linear from none at the first frame to these at the last.
+    """Changes gain and bias of the colours linearly, from none to these at the last frame.
 
     Attributes:
-        gain: at the last frame; 1 = no change.
-        bias: at the last frame, in steps of 255; 0 = no change.
+        gain: gain at the last frame; 1 = no change.
+        bias: bias at the last frame, in steps of 255; 0 = no change.
     """
 
     gain: float = bounded(0.6, 0.01, 100.0)
@@ -177,15 +177,15 @@ class ExposureRamp(Checked, GainAndBias):
 
 @dataclass(frozen=True)
 class ExposureJumps(Checked, GainAndBias):
-    """Gain and bias of the colour values, drawn anew every few frames and held until the next draw.
+    """Draws a new gain and bias of the colours every few frames.
 
     The first frames are unchanged.
 
     Attributes:
-        gain: largest factor up or down; the logarithm is uniform; 1 = no change.
+        gain: largest factor up or down, with uniform logarithm; 1 = no change.
         bias: largest bias up or down, in steps of 255.
-        every: frames between two draws.
-        seed: of the draws, beside the sequence's.
+        every: number of frames between two draws.
+        seed: seed of the draws, in addition to the sequence's.
     """
 
     gain: float = bounded(1.5, 1.0, 100.0)
@@ -205,11 +205,11 @@ class ExposureJumps(Checked, GainAndBias):
 
 @dataclass(frozen=True)
 class BlackFrames(Checked, ImagePerturbation):
-    """Runs of frames without colour and without depth.
+    """Runs of consecutive frames without colour and depth.
 
     Attributes:
         start: first black frame (index on the trajectory).
-        length: frames in a row; 0 = off.
+        length: number of frames in a run; 0 = off.
         every: frames from the start of one run to the start of the next; 0 = one run only.
     """
 
@@ -218,7 +218,7 @@ class BlackFrames(Checked, ImagePerturbation):
     every: int = bounded(0, 0, 10_000_000)
 
     def is_black(self, index: int) -> bool:
-        """Whether the frame of this index is black."""
+        """Whether the frame with this index is black."""
         since = index - self.start
         if since < 0:
             return False

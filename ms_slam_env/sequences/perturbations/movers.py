@@ -1,4 +1,4 @@
-"""Things on the move: their ways with the pace on them, and their bodies at any time."""
+"""Moving objects: their routes with speed, and their bodies at any time."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ _MOST_PROBES = 40
 
 @dataclass(frozen=True)
 class Track:
-    """A way with its pace.
+    """A route with timing.
 
     Attributes:
-        points: (M, 3) positions, densely spaced; of a closed way the last is the first again.
-        yaws: (M,) heading at the points, radians, without jumps; of a closed way the last differs
+        points: (M, 3) densely spaced positions; on a closed route the last equals the first.
+        yaws: (M,) heading at the points, radians, without jumps; on a closed route the last differs
             from the first by whole turns.
-        times_s: (M,) when the points are reached, from 0.
-        way_m: (M,) how far it is to them.
+        times_s: (M,) times at which the points are reached, from 0.
+        way_m: (M,) distance travelled to the points.
     """
 
     points: Float64
@@ -42,11 +42,11 @@ class Track:
 
     @property
     def period_s(self) -> float:
-        """Time of one round."""
+        """Duration of one round."""
         return float(self.times_s[-1])
 
     def at(self, clock_s: ArrayLike) -> tuple[Float64, Float64, Float64]:
-        """Positions (..., 3), headings (...) and ways (...) at times (...), rounds included."""
+        """Positions (..., 3), headings (...), distances (...) at times (...), over all rounds."""
         clock = np.asarray(clock_s, dtype=np.float64)
         rounds = np.floor(clock / self.period_s)
         t = clock - rounds * self.period_s
@@ -58,14 +58,14 @@ class Track:
 def round_track(
     start: Float64, end: Float64, half_width_m: float, speed_m_s: float, turn_rad_s: float
 ) -> Track:
-    """There and back between two points (3,), on two lanes, turning at the ends.
+    """Make a route back and forth between two points (3,), on two lanes, turning at the ends.
 
     Args:
-        start: middle of one turn.
-        end: middle of the other.
-        half_width_m: of the way; the lanes lie so far from the line between the points.
+        start: centre of one turn.
+        end: centre of the other turn.
+        half_width_m: distance of each lane from the line between the points.
         speed_m_s: largest speed.
-        turn_rad_s: largest speed of turning.
+        turn_rad_s: largest angular speed.
     """
     along = end - start
     ahead = np.array([along[0], along[1], 0.0])
@@ -92,7 +92,7 @@ def round_track(
 
 
 def straight_track(start: Float64, end: Float64, speed_m_s: float) -> Track:
-    """From one point (3,) straight to another, and again from the first."""
+    """Make a straight route from one point (3,) to another, repeated from the first."""
     along = end - start
     share = np.linspace(0.0, 1.0, max(2, int(np.linalg.norm(along) / 0.25)))[:, None]
     yaws = np.full(len(share), np.arctan2(along[1], along[0]))
@@ -114,26 +114,26 @@ def _paced(points: Float64, yaws: Float64, speed_m_s: float, turn_rad_s: float) 
 class Mover:
     """One moving object.
 
-    Where it is depends on its clock, which runs with the time of the frames from ``phase_s`` on;
-    ``wait`` makes it stand still for a while.
+    Its position depends on its clock, which starts at ``phase_s`` and runs with the frames' time;
+    ``wait`` stops it for a while.
 
     Attributes:
-        name: of the object.
-        shape: what it is.
-        track: its way.
+        name: name of the object.
+        shape: its shape.
+        track: its route.
     """
 
     def __init__(
         self, name: str, shape: Shape, track: Track, phase_s: float, spin_rad_s: float = 0.0
     ) -> None:
-        """Put it on its way; with ``spin_rad_s`` it turns on the spot instead of looking ahead."""
+        """Place it on its route; with ``spin_rad_s`` it spins instead of facing ahead."""
         self.name, self.shape, self.track = name, shape, track
         self._spin = spin_rad_s
         self._phase = phase_s
-        self._waits: list[tuple[float, float]] = []  # (from, how long), in order
+        self._waits: list[tuple[float, float]] = []  # (start, duration), in order
 
     def clock(self, times_s: ArrayLike) -> Float64:
-        """Its clock (...) at times (...) in seconds."""
+        """Clock (...) at times (...), in seconds."""
         t = np.asarray(times_s, dtype=np.float64)
         clock = t + self._phase
         for start, duration in self._waits:
@@ -141,7 +141,7 @@ class Mover:
         return clock
 
     def wait(self, start_s: float, duration_s: float) -> None:
-        """Stand still from a time on, for so long; waits must come in order."""
+        """Stand still for ``duration_s`` from ``start_s`` on; waits must come in order."""
         self._waits.append((float(start_s), float(duration_s)))
 
     def get_state(self) -> list[tuple[float, float]]:
@@ -149,7 +149,7 @@ class Mover:
         return list(self._waits)
 
     def set_state(self, waits: list[tuple[float, float]]) -> None:
-        """Go on from what ``get_state`` returned."""
+        """Restore what ``get_state`` returned."""
         self._waits = [(float(time), float(length)) for time, length in waits]
 
     def pose(self, times_s: ArrayLike) -> Float64:
@@ -170,19 +170,19 @@ class Mover:
         return T, ways
 
     def middle(self, times_s: ArrayLike) -> Float64:
-        """Middle (..., 3) of the object at times (...)."""
+        """Centre (..., 3) of the object at times (...)."""
         points, _, _ = self.track.at(self.clock(times_s))
         height = 0.5 * (self.shape.height_m - self.shape.depth_m)
         return points + np.array([0.0, 0.0, height])
 
     @property
     def reach_m(self) -> float:
-        """Radius of a ball about the middle that holds it."""
+        """Radius of the enclosing ball about its centre."""
         half = 0.5 * (self.shape.height_m + self.shape.depth_m)
         return float(np.hypot(self.shape.radius_m, half))
 
     def distance(self, points: Float64, times_s: Float64) -> Float64:
-        """Distance (N,) of points (N, 3) from the box around the object at times (N,)."""
+        """Distance (N,) of points (N, 3) from the object's bounding box at times (N,)."""
         T = self.pose(times_s)
         local = np.einsum("nji,nj->ni", T[:, :3, :3], points - T[:, :3, 3])
         shape = self.shape
@@ -191,7 +191,7 @@ class Mover:
         return np.linalg.norm(local - np.clip(local, low, high), axis=1)
 
     def outline(self, times_s: Float64) -> Float64:
-        """Nine points (9, N, 3) of the object at times (N,): its middle, corners and sides."""
+        """Nine points (9, N, 3) of the object at times (N,): its centre, corners and sides."""
         T = self.pose(times_s)
         shape = self.shape
         z = 0.5 * (shape.height_m - shape.depth_m)
@@ -202,7 +202,7 @@ class Mover:
         return np.swapaxes(local @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3], 0, 1)
 
     def bodies(self, probe: LightProbe) -> list[Body]:
-        """What the sensor sees of it."""
+        """The bodies that the sensor sees."""
         light = self._light(probe)
         return [
             Body(self.name, part.mesh, partial(self._part_pose, part.joint), light)
@@ -214,7 +214,7 @@ class Mover:
         return T @ joint.pose(ways)
 
     def _light(self, probe: LightProbe) -> Callable[[float], Float64]:
-        """The light around the object at a time, between probes along its way."""
+        """The light around the object at a time, interpolated between probes along its route."""
         track = self.track
         count = int(np.clip(track.way_m[-1] / _LIGHT_EVERY_M, 2, _MOST_PROBES))
         instants = np.linspace(0.0, track.period_s, count)
@@ -233,7 +233,7 @@ class Mover:
 
 
 def bodies_of(movers: Sequence[Mover], scene: Scene) -> list[Body]:
-    """What the sensor sees of moving objects, in the light of a scene."""
+    """The bodies of moving objects, in the light of a scene."""
     if not movers:
         return []
     probe = LightProbe(scene.mesh)

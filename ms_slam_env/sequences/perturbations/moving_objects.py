@@ -1,4 +1,4 @@
-"""Objects that move through the scene, and where they can go."""
+"""Objects that move through the scene, on free routes."""
 
 from __future__ import annotations
 
@@ -20,41 +20,41 @@ from ms_slam_env.sequences.perturbations.perturbation import WorldPerturbation, 
 from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 _TRIES = 4000
-_CANDIDATES = 8  # free ways among which the one that is seen most is taken
-_PHASES = 3  # starts on each
-_INSTANTS = 40  # of the camera's path at which is checked who sees what and who is near whom
-_NEAREST_CAMERA_M = 0.35  # between the camera and the object's outline
+_CANDIDATES = 8  # free routes to choose from; the one seen most is used
+_PHASES = 3  # starting phases on each
+_INSTANTS = 40  # of the camera's path at which visibility and distances are checked
+_NEAREST_CAMERA_M = 0.35  # least distance between the camera and the object's outline
 _NEAREST_OTHER_M = 0.15
 _SPIN_RAD_S = 0.5
 
 
-_MARGIN_M = 0.03  # kept from the scene's surfaces
-_FLAT_M = 0.06  # the ground may rise or fall by so much along a way, rugs and kerbs included
+_MARGIN_M = 0.03  # least distance from the scene's surfaces
+_FLAT_M = 0.06  # largest height difference of the ground along a route, including rugs and kerbs
 _TURN_RAD_S = np.radians(120.0)
 _HALF_WIDTH_M = (0.08, 0.25)
-_WAYS_A_PLACE = (4, 40)  # fewest and most; the more, the fewer places are free
-_AROUND_M = 6.0  # of the camera: there floor and room are looked for
+_WAYS_A_PLACE = (4, 40)  # fewest and most routes per place; more if few places are free
+_AROUND_M = 6.0  # radius around the camera in which floor and space are searched for
 _SOUNDINGS = 400
 _LANE_STEP_M = 0.25
-_LONGEST_M = {"box": 1.5, "person": 3.0, "car": 40.0}  # from the middle of the way to its end
+_LONGEST_M = {"box": 1.5, "person": 3.0, "car": 40.0}  # from the centre of the route to its end
 _SHORTEST_M = {"box": 0.25, "person": 0.25, "car": 2.0}
 _DEPTHS_M = {"box": (0.9, 3.0), "person": (1.2, 6.0), "car": (4.0, 25.0)}
 
 
 @dataclass(frozen=True)
 class MovingObjects(Checked, WorldPerturbation):
-    """Parcels, people or cars on the move, seen in colour and depth and in the labels.
+    """Moving boxes, people or cars, visible in colour, depth and labels.
 
-    Boxes float through free space and turn; people walk on the ground; both go there and back on a
-    rounded way. Cars drive along a lane of the scene, or along a straight free way on the ground,
-    and again from its beginning. The ways keep clear of the scene, of the camera and of each
-    other; among those drawn the one is taken on which the camera sees most of the object.
+    Boxes float through free space and spin; people walk on the ground; both move back and forth on
+    a rounded route. Cars drive repeatedly along a lane of the scene, or along a straight free route
+    on the ground. Routes keep clear of the scene, the camera and each other; among the candidates
+    the one is used on which the camera sees most of the object.
 
     Attributes:
         kind: box, person or car.
-        count: of the objects; 0 = none.
+        count: number of objects; 0 = none.
         speed_m_s: largest speed; people slow down to turn.
-        seed: of looks and ways, beside the sequence's.
+        seed: seed of appearance and routes, in addition to the sequence's.
 
     Raises:
         InputError: unknown kind, or a value out of range.
@@ -76,7 +76,7 @@ class MovingObjects(Checked, WorldPerturbation):
         """See the base class.
 
         Raises:
-            InputError: no free way for one of them.
+            InputError: no free route for one of them.
         """
         times = _instants(camera)
         poses = camera(times)
@@ -100,7 +100,7 @@ class MovingObjects(Checked, WorldPerturbation):
         spin = rng.uniform(-_SPIN_RAD_S, _SPIN_RAD_S) if self.kind == "box" else 0.0
         places = Places(scene, poses, intrinsics, rng)
         best, best_score, found = None, -1.0, 0
-        # Near to a table or a wall nothing fits in between: then it begins out of sight.
+        # Close to a table or a wall nothing fits in between: then it starts out of view.
         for anywhere in (False, True):
             if best is not None:
                 break
@@ -130,16 +130,16 @@ def _instants(camera: PoseInterpolation) -> Float64:
 
 
 def _keeps_clear(mover: Mover, times: Float64, poses: Float64, others: list[Mover]) -> bool:
-    """Whether it never comes too near to the camera or another object."""
+    """Whether it never comes too close to the camera or another object."""
     if (mover.distance(poses[:, :3, 3], times) < _NEAREST_CAMERA_M).any():
         return False
-    # A minute beyond the path: where time goes on, objects go on.
+    # A minute beyond the path, because objects keep moving as time continues.
     more = np.concatenate([times, times[-1] + np.arange(0.2, 60.0, 0.2)])
     return all(_are_apart(mover, other, more) for other in others)
 
 
 def _are_apart(a: Mover, b: Mover, times: Float64) -> bool:
-    """Whether two objects never come too near to each other."""
+    """Whether two objects never come too close to each other."""
     gap = np.linalg.norm(a.middle(times) - b.middle(times), axis=1)
     if gap.min() < 0.5 * (a.shape.width_m + b.shape.width_m):
         return False
@@ -154,7 +154,7 @@ def _are_apart(a: Mover, b: Mover, times: Float64) -> bool:
 def _seen(
     mover: Mover, scene: Scene, times: Float64, poses: Float64, intrinsics: Intrinsics
 ) -> float:
-    """Share of the instants at which the camera has the middle of it in view, unhidden."""
+    """Share of the instants at which the camera sees its centre unoccluded."""
     middle = mover.middle(times)
     offsets = np.einsum("kji,kj->ki", poses[:, :3, :3], middle - poses[:, :3, 3])
     u, v = intrinsics.project(offsets).T
@@ -168,12 +168,12 @@ def _seen(
 
 
 class Places:
-    """Free ways of a shape in a scene, drawn where a camera looks."""
+    """Free routes for a shape in a scene, drawn where a camera looks."""
 
     def __init__(
         self, scene: Scene, camera: Float64, intrinsics: Intrinsics, rng: np.random.Generator
     ) -> None:
-        """Take the poses (K, 4, 4) of the camera."""
+        """Prepare for the camera's poses (K, 4, 4)."""
         self._scene, self._camera, self._K, self._rng = scene, camera, intrinsics, rng
         self._rays = RayCaster(scene.mesh.vertices, scene.mesh.faces)
         self._ground_z = self._ground()
@@ -181,7 +181,7 @@ class Places:
     def tracks(
         self, shape: Shape, speed_m_s: float, tries: int, anywhere: bool = False
     ) -> Iterator[Track]:
-        """Try ``tries`` ways, in view or ``anywhere`` near the camera; give those that are free."""
+        """Draw ``tries`` routes, in view or ``anywhere`` near the camera; yield the free ones."""
         if shape.kind == "car" and self._scene.lanes:
             for _ in range(tries):
                 start, end = self._scene.lanes[int(self._rng.integers(len(self._scene.lanes)))]
@@ -201,7 +201,7 @@ class Places:
                     yield track
 
     def _ground(self) -> float:
-        """Height of the floor: nearly the lowest of what lies beneath free places."""
+        """Height of the floor: nearly the lowest surface beneath free places."""
         near = self._camera[:, :3, 3]
         places = np.concatenate([near, self._rng.uniform(*self._around(), (_SOUNDINGS, 3))])
         free = places[self._scene.clearance(places) > 0.1]
@@ -210,7 +210,7 @@ class Places:
         return float(np.percentile(heights, 5)) if len(heights) else 0.0
 
     def _around(self) -> tuple[Float64, Float64]:
-        """Least and greatest corner (3,) of the scene, as far as it is near the camera's path."""
+        """Lower and upper corner (3,) of the part of the scene near the camera's path."""
         low, high = self._scene.bounds()
         near = self._camera[:, :2, 3]
         low[:2] = np.maximum(low[:2], near.min(0) - _AROUND_M)
@@ -218,7 +218,7 @@ class Places:
         return low, high
 
     def _points_in_view(self, kind: str, count: int) -> Float64:
-        """Points (count, 3) in front of the camera's poses; of walkers and cars on the ground."""
+        """Points (count, 3) in front of the camera's poses; on the ground for people and cars."""
         rng, K = self._rng, self._K
         T = self._camera[rng.integers(len(self._camera), size=count)]
         z = rng.uniform(*_DEPTHS_M[kind], count)
@@ -226,7 +226,7 @@ class Places:
         y = (rng.uniform(0.2, 0.8, count) * K.height - K.cy) / K.fy
         local = np.stack([x * z, y * z, z], -1)
         points = np.einsum("kij,kj->ki", T[:, :3, :3], local) + T[:, :3, 3]
-        if kind != "box":  # where there is little room it may also begin out of sight
+        if kind != "box":  # in little space it may also start out of view
             anywhere = count // 3
             points[:anywhere] = rng.uniform(*self._around(), (anywhere, 3))
             points[:, 2] = self._ground_z
@@ -237,7 +237,7 @@ class Places:
         return np.array([np.cos(angle), np.sin(angle), 0.0])
 
     def _round(self, shape: Shape, middle: Float64, speed_m_s: float) -> Track | None:
-        """There and back along a free line."""
+        """Route back and forth along a free line."""
         rng, kind = self._rng, shape.kind
         along = self._direction()
         if kind == "box":
@@ -256,7 +256,7 @@ class Places:
         return track if self._are_free(shape, points[::4]).all() else None
 
     def _straight(self, shape: Shape, middle: Float64, speed_m_s: float) -> Track | None:
-        """As far as the ground is free and level to both sides of a point."""
+        """Straight route as far as the ground is free and level on both sides of a point."""
         along = self._direction()
         steps = np.arange(0.0, _LONGEST_M[shape.kind], _LANE_STEP_M)
         ends = []
@@ -272,8 +272,8 @@ class Places:
         return straight_track(ends[0], ends[1], speed_m_s)
 
     def _are_free(self, shape: Shape, points: Float64) -> NDArray[np.bool_]:
-        """(N,) whether the shape on its way fits at points (N, 3)."""
-        # A car goes straight, so only its width matters; the rest may turn.
+        """Whether (N,) the moving shape fits at points (N, 3)."""
+        # A car drives straight, so only its width matters; others may turn.
         radius = (0.5 * shape.width_m if shape.kind == "car" else shape.radius_m) + _MARGIN_M
         if shape.kind == "box":
             return self._scene.clearance(points) > radius

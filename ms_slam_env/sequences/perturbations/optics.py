@@ -1,4 +1,4 @@
-"""How frames are taken: shutter, blur, unregistered colour; and when: haste, frames lost."""
+"""Perturbations of optics (shutter, blur, misregistration, lens) and timing."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 @dataclass(frozen=True)
 class RollingShutter(Checked, OpticalPerturbation):
-    """Colour and depth are read row by row, from top to bottom, while the camera moves.
+    """Rolling shutter: colour and depth are read row by row, top to bottom, during motion.
 
-    Every two rows are rendered from the pose that the camera has at their own time. The time stamp,
-    and with it the true pose, of a frame is that of the middle of the image.
+    Every two rows are rendered from the camera's pose at their own time. A frame's time stamp, and
+    so its true pose, is that of the middle row.
 
     Attributes:
-        readout_s: time from the first row to the last; 0 = off. The default is most of the time
-            between two frames at 30 Hz.
+        readout_s: time from the first row to the last; 0 = off. The default is most of the frame
+            interval at 30 Hz.
     """
 
     readout_s: float = bounded(0.03, 0.0, 10.0)
@@ -44,14 +44,14 @@ class RollingShutter(Checked, OpticalPerturbation):
 
 @dataclass(frozen=True)
 class MotionBlur(Checked, OpticalPerturbation):
-    """Colour is the mean of the linear light at instants spread over the exposure time.
+    """Motion blur: colour is the mean linear light over instants of the exposure time.
 
-    The exposure is centred on the time of the frame (of the row, if the shutter rolls). Depth,
+    The exposure is centred on the time of the frame, or of the row with a rolling shutter. Depth,
     which is read from a projected pattern, is taken at the centre.
 
     Attributes:
-        exposure_s: time over which light is gathered; 0 = off.
-        samples: instants, evenly spaced.
+        exposure_s: exposure time; 0 = off.
+        samples: number of evenly spaced instants.
     """
 
     exposure_s: float = bounded(0.02, 0.0, 10.0)
@@ -68,16 +68,16 @@ class MotionBlur(Checked, OpticalPerturbation):
 
 @dataclass(frozen=True)
 class Misregistration(Checked, OpticalPerturbation):
-    """Colour and depth, taken by two cameras, are handed on as if they were one image.
+    """Misregistration: colour and depth come from two cameras but are treated as one.
 
-    The frame's intrinsics and pose stay those of the depth camera. The defaults are a Kinect's
-    whose driver registers nothing, as in 7-Scenes.
+    The frame's intrinsics and pose stay those of the depth camera. The defaults are those of a
+    Kinect without registration, as in 7-Scenes.
 
     Attributes:
         focal_ratio: focal length of the colour camera over that of the depth camera; 1 = equal.
-        baseline_m: the colour camera stands so far along the depth camera's x; 0 = at its place.
-        shift_x_px: the colour image lies so many pixels too far to the right.
-        shift_y_px: and so many too far down.
+        baseline_m: position of the colour camera along the depth camera's x; 0 = same position.
+        shift_x_px: pixels by which the colour image is too far to the right.
+        shift_y_px: pixels by which it is too far down.
     """
 
     focal_ratio: float = bounded(525.0 / 585.0, 0.1, 10.0)
@@ -101,17 +101,17 @@ class Misregistration(Checked, OpticalPerturbation):
 
 @dataclass(frozen=True)
 class LensDistortion(Checked, OpticalPerturbation):
-    """A lens bends both images, which are handed on as if they were a pinhole camera's.
+    """Lens distortion of both images, which are treated as pinhole images.
 
-    Coefficients as in ``Distortion``. The defaults are about those of a colour camera with a wide
-    lens: barrel distortion of some two pixels in a corner at 160x120.
+    Coefficients as in ``Distortion``. The defaults are about those of a wide-angle colour camera:
+    barrel distortion of about two pixels in a corner at 160x120. All 0 = off.
 
     Attributes:
-        k1: of r^2,
-        k2: of r^4,
-        p1: tangential, down,
-        p2: tangential, across,
-        k3: of r^6; all 0 = off.
+        k1: coefficient of r^2.
+        k2: coefficient of r^4.
+        p1: tangential coefficient, down.
+        p2: tangential coefficient, across.
+        k3: coefficient of r^6.
     """
 
     k1: float = bounded(-0.1, -0.4, 1.0)
@@ -127,7 +127,7 @@ class LensDistortion(Checked, OpticalPerturbation):
 
 
 def linear_of_srgb(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Linear intensity in [0, 1] of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    """Convert sRGB values in [0, 1] to linear intensity in [0, 1] (IEC 61966-2-1)."""
     v = np.asarray(values, dtype=np.float64)
     return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
 
@@ -139,15 +139,15 @@ def srgb_of_linear(intensity: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 class LinearLight:
-    """Averages colour images as a sensor gathers light."""
+    """Averages colour images in linear light, as a sensor does."""
 
     def __init__(self, noise: NoiseConfig) -> None:
-        """Take the noise of the intensity: variance = read^2 + shot * intensity."""
+        """Set the intensity noise: variance = read^2 + shot * intensity."""
         self._noise = noise
         self._decode = linear_of_srgb(np.arange(256) / 255.0)
 
     def mean(self, colors: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-        """Image (H, W, 3) of noise-free images (K, H, W, 3) of equal duration."""
+        """Average noise-free images (K, H, W, 3) of equal duration to one image (H, W, 3)."""
         light = self._decode[colors].mean(axis=0)
         sigma = np.sqrt(self._noise.read**2 + self._noise.shot * light)
         if sigma.any():
@@ -156,21 +156,21 @@ class LinearLight:
 
 
 _STEP_S = 1e-3
-_RAMP = 0.25  # share of a stretch over which the speed rises, and falls again
+_RAMP = 0.25  # share of a segment over which the speed rises, and falls again
 
 
 @dataclass(frozen=True)
 class FastMotion(Checked, MotionPerturbation):
-    """The camera hurries: the same path, in stretches ``factor`` times as fast.
+    """Fast motion: the same path, in segments ``factor`` times as fast.
 
-    The time between frames does not change, so a hurried path has fewer frames. Speed rises and
-    falls smoothly. Frames have the poses of where the camera then is.
+    The frame interval does not change, so the path has fewer frames. Speed rises and falls
+    smoothly. Frames have the poses of the faster camera.
 
     Attributes:
-        factor: of the speed in the middle of a stretch; 1 = off.
-        share: of the time that is in stretches.
-        length_s: of one stretch; shorter where the path is too short for it.
-        seed: of when they begin, beside the sequence's.
+        factor: speed factor in the middle of a segment; 1 = off.
+        share: share of the time in fast segments.
+        length_s: duration of a segment; shorter if the path is too short.
+        seed: seed of the segments' starts, in addition to the sequence's.
     """
 
     factor: float = bounded(3.0, 1.0, 100.0)
@@ -184,36 +184,36 @@ class FastMotion(Checked, MotionPerturbation):
             return path
         progress = self.progress(path.times_s - path.times_s[0], seed)
         is_reached = progress <= path.times_s[-1] - path.times_s[0]
-        count = max(2, int(is_reached.sum()))  # increasing: the first ones
+        count = max(2, int(is_reached.sum()))  # progress increases, so these are the first ones
         return PoseInterpolation(path.times_s[:count], path(path.times_s[0] + progress[:count]))
 
     def progress(self, since_s: Float64, seed: int) -> Float64:
-        """How far along the path (N,), in seconds of the old pace, at times (N,) since 0 s."""
+        """Position (N,) on the path, in seconds at the original pace, at times (N,) from 0 s."""
         dense = np.arange(0.0, since_s[-1] + 2 * _STEP_S, _STEP_S)
         pace = 1.0 + (self.factor - 1.0) * self._hurry(dense, seed)
         way = np.concatenate([[0.0], np.cumsum(0.5 * (pace[1:] + pace[:-1]) * _STEP_S)])
         return np.interp(since_s, dense, way)
 
     def _hurry(self, t: Float64, seed: int) -> Float64:
-        """0 outside of the stretches, 1 in their middle: one stretch in every period."""
-        length = min(self.length_s, self.share * t[-1])  # a short path has a stretch too
+        """Speed profile: 0 outside the segments, 1 in their middle; one segment per period."""
+        length = min(self.length_s, self.share * t[-1])  # a short path has a segment too
         period = length / self.share
         number = (t // period).astype(np.int64)
         rng = random_numbers(seed, self.seed, name="fast-motion")
         begins = rng.uniform(0.0, period - length, int(number[-1]) + 1)[number]
-        along = (t - number * period - begins) / length  # 0 to 1 within the stretch
+        along = (t - number * period - begins) / length  # 0 to 1 within the segment
         ramp = np.clip(np.minimum(along, 1.0 - along) / _RAMP, 0.0, 1.0)
         return ramp * ramp * (3.0 - 2.0 * ramp)
 
 
 @dataclass(frozen=True)
 class FrameSkipping(Checked, FrameSelection):
-    """Keeps every n-th frame, and loses some of those at random; the first is always kept.
+    """Keeps every n-th frame, and drops some of those at random; the first is always kept.
 
     Attributes:
-        keep_every: 1 = all.
+        keep_every: n; 1 = all.
         lost: probability that a frame is lost.
-        seed: of the losses, beside the sequence's.
+        seed: seed of the losses, in addition to the sequence's.
     """
 
     keep_every: int = bounded(2, 1, 1_000_000)

@@ -1,7 +1,6 @@
-"""What a perturbation of a rendered sequence may change, and what it may ask.
+"""Interfaces of perturbations of a rendered sequence.
 
-Kinds, applied in this order: how the camera moves, which frames there are, what there is to see,
-how the frames are taken, what is in them.
+Kinds, applied in this order: camera motion, frame selection, scene content, optics, images.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from ms_slam_env.sequences.trajectory import PoseInterpolation
 
 
 def random_numbers(*keys: int, name: str) -> np.random.Generator:
-    """Generator that depends on the integers >= 0 ``keys`` and on ``name`` alone.
+    """Make a generator that depends only on the integers >= 0 ``keys`` and on ``name``.
 
     Raises:
         InputError: a key that is not an integer >= 0.
@@ -37,15 +36,15 @@ def random_numbers(*keys: int, name: str) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class Optics:
-    """How a frame is taken.
+    """Optics of a frame.
 
     Attributes:
         color: intrinsics of the colour camera; its image has the size of the depth image.
         T_depth_color: (4, 4) pose of the colour camera in the depth camera's frame.
         readout_s: time from the first row to the last; 0 = all rows at once.
         exposure_s: time over which colour is integrated; 0 = an instant.
-        exposure_samples: instants whose mean stands for the integral.
-        lens: of both cameras.
+        exposure_samples: number of instants that approximate the integral.
+        lens: distortion of both cameras.
     """
 
     color: Intrinsics
@@ -58,16 +57,16 @@ class Optics:
 
 @dataclass(frozen=True)
 class Moment:
-    """What a perturbation may know of a frame.
+    """Information about a frame for perturbations.
 
     Attributes:
-        index: of the frame on the trajectory, before any frame was skipped.
-        count: poses of the trajectory.
+        index: index of the frame on the trajectory, before any frame was skipped.
+        count: number of poses of the trajectory.
         timestamp: seconds.
-        intrinsics: of the frames.
-        seed: of the sequence.
-        brightness: gives the mean intensity (count,) in [0, 255] of what is seen from every pose
-            of the trajectory, or of those so far; computed at the first call.
+        intrinsics: intrinsics of the frames.
+        seed: seed of the sequence.
+        brightness: function that returns the mean intensity (count,) in [0, 255] of the view from
+            every pose of the trajectory, or of those so far; computed at the first call.
     """
 
     index: int
@@ -79,7 +78,7 @@ class Moment:
 
 
 class Perturbation(ABC):  # noqa: B024 - its kinds share a name and no method
-    """One imperfection of a camera or of a recording. Leave it out of the list to switch it off."""
+    """One imperfection of a camera or of a recording; omit it from the list to turn it off."""
 
 
 class MotionPerturbation(Perturbation):
@@ -91,15 +90,15 @@ class MotionPerturbation(Perturbation):
 
 
 class FrameSelection(Perturbation):
-    """Decides which frames of the trajectory there are."""
+    """Selects frames of the trajectory."""
 
     @abstractmethod
     def keep(self, count: int, seed: int) -> Int64:
-        """Indices kept of ``count`` frames, increasing; ``seed`` is that of the sequence."""
+        """Increasing indices to keep of ``count`` frames; ``seed`` is that of the sequence."""
 
 
 class WorldPerturbation(Perturbation):
-    """Changes what there is to see."""
+    """Changes the content of the scene."""
 
     @abstractmethod
     def populate(
@@ -110,9 +109,9 @@ class WorldPerturbation(Perturbation):
         seed: int,
         others: Sequence[Mover] = (),
     ) -> tuple[Mover, ...]:
-        """Return the things that move through ``scene`` while ``camera`` is on its way.
+        """Return objects that move through ``scene`` while ``camera`` follows its path.
 
-        ``others`` are on the move there already.
+        ``others`` move there already.
         """
 
 
@@ -123,11 +122,11 @@ class LightPerturbation(Perturbation):
     def light(
         self, scene: Scene, camera: PoseInterpolation, intrinsics: Intrinsics, seed: int
     ) -> ChangingLight | None:
-        """Return the light of ``scene`` while ``camera`` is on its way; None as it is."""
+        """Return the changing light of ``scene`` while ``camera`` follows its path, or None."""
 
 
 class OpticalPerturbation(Perturbation):
-    """Changes how frames are taken."""
+    """Changes the optics."""
 
     @abstractmethod
     def alter(self, optics: Optics) -> Optics:
@@ -135,8 +134,8 @@ class OpticalPerturbation(Perturbation):
 
 
 class ImagePerturbation(Perturbation):
-    """Changes the images of a frame that was taken."""
+    """Changes the images of a captured frame."""
 
     @abstractmethod
     def apply(self, frame: RGBDFrame, moment: Moment) -> RGBDFrame:
-        """Return the changed frame; a function of the two arguments alone."""
+        """Return the changed frame, which must depend on the two arguments alone."""

@@ -1,4 +1,4 @@
-"""Frames of a bag: how the cameras and the body of the true poses stand to each other."""
+"""Coordinate frames of a bag: transforms between the cameras and the body of the true poses."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from ms_slam_env.camera.depth_registration import ColorCamera
 from ms_slam_env.errors import InputError, InputWarning
 from ms_slam_env.geometry import check_pose, invert, pose_from_quaternion
 
-_SAME_M = 1e-3  # cameras that stand as near, or are turned by as many radians, are one
+_SAME_M = 1e-3  # metres or radians; cameras that differ by less are the same
 _SAME_PX = 0.5
 
 Transforms = dict[tuple[str, str], Float64]
-"""Parent and child frame to T_parent_child (4, 4)."""
+"""T_parent_child (4, 4) by parent and child frame."""
 
 
 def transforms_of(messages: Iterable[tuple[float, Any]], topic: str) -> Transforms:
-    """What messages of ``/tf_static`` say, the last word on each pair of frames."""
+    """Transforms from ``/tf_static`` messages; the last one for each pair of frames counts."""
     found: Transforms = {}
     for _, message in messages:
         for one in message.transforms:
@@ -36,12 +36,12 @@ def transforms_of(messages: Iterable[tuple[float, Any]], topic: str) -> Transfor
 
 
 def plain(frame: str) -> str:
-    """The name of a frame without the slash that ROS 1 may put before it."""
+    """A frame's name without the leading slash of ROS 1."""
     return str(frame).lstrip("/")
 
 
 def find_transform(known: Transforms, a: str, b: str) -> Float64 | None:
-    """T_a_b (4, 4) along the tree of frames; None where nothing joins the two."""
+    """T_a_b (4, 4) along the tree of frames; None if they are not connected."""
     edges = known | {(child, parent): invert(T) for (parent, child), T in known.items()}
     reached, before = {a: np.eye(4)}, 0
     while len(reached) > before:
@@ -58,16 +58,16 @@ def registration_of(
     cameras: tuple[Intrinsics, Intrinsics | None],
     known: Transforms,
 ) -> ColorCamera | None:
-    """How colour is brought into the depth camera; None where both are of one camera.
+    """How to register colour to the depth camera; None if both come from one camera.
 
     Args:
-        path: of the bag, for messages.
-        frames: that images of depth and of colour say they are of; empty says nothing.
-        cameras: calibrations of depth and of colour, None where there is none of its own.
+        path: path of the bag, for messages.
+        frames: frames named by the depth and the colour images; empty if unknown.
+        cameras: calibrations of depth and colour; None if colour has none of its own.
         known: transforms between frames.
 
     Raises:
-        InputError: images of two frames, and nothing says how these stand to each other.
+        InputError: the images have different frames, and no transform between them is known.
     """
     (depth, color), (K, of_color) = map(plain, frames), cameras
     T = np.eye(4)
@@ -94,7 +94,7 @@ def registration_of(
 
 
 def _is_same(one: Intrinsics, other: Intrinsics) -> bool:
-    """Whether two calibrations are of one camera."""
+    """Whether two calibrations belong to the same camera."""
     numbers = [np.array([K.fx, K.fy, K.cx, K.cy]) for K in (one, other)]
     return (
         one.shape == other.shape
@@ -106,7 +106,7 @@ def _is_same(one: Intrinsics, other: Intrinsics) -> bool:
 def poses_of_camera(
     path: object, topic: str, poses: Float64, body: str, camera: str, known: Transforms
 ) -> Float64:
-    """T_world_camera (N, 4, 4) of poses of a body; one that nothing joins is warned of."""
+    """T_world_camera (N, 4, 4) from poses of a body; warn if no transform connects them."""
     body, camera = plain(body), plain(camera)
     if not body or not camera or body == camera:
         return poses

@@ -1,4 +1,4 @@
-"""Image messages of ROS to arrays: raw, compressed, and compressed depth."""
+"""Converts ROS image messages to arrays: raw, compressed, and compressed depth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ms_slam_env.camera.image_files import check_size, decode_color, decode_dept
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.sequences.recording.recording import SATURATED
 
-# Encoding to channels, and which of them are red, green and blue.
+# By encoding: number of channels, and which of them are red, green and blue.
 _COLORS = {
     "rgb8": (3, (0, 1, 2)),
     "bgr8": (3, (2, 1, 0)),
@@ -25,17 +25,17 @@ _COLORS = {
     "mono8": (1, (0, 0, 0)),
     "8UC1": (1, (0, 0, 0)),
 }
-# Encoding to type of a value, and its value for one metre (REP 118).
+# By encoding: type of a value, and the value per metre (REP 118).
 _DEPTHS = {"16UC1": ("u2", 1000.0), "mono16": ("u2", 1000.0), "32FC1": ("f4", 1.0)}
-_DEPTH_HEADER = 12  # bytes before the image of compressed depth: its format and two numbers
+_DEPTH_HEADER = 12  # bytes before the image in compressed depth: its format and two numbers
 
 
 def read_color_message(message: Any, topic: str, camera: Intrinsics) -> NDArray[np.uint8]:
     """Colour (H, W, 3) of an Image or a CompressedImage.
 
     Raises:
-        InputError: an encoding that is none of colour, an image that is cut off, damaged, or of
-            another size than ``camera`` says.
+        InputError: not a colour encoding, or an image that is truncated, damaged, or whose size
+            differs from ``camera``.
     """
     if hasattr(message, "format"):
         return decode_color(bytes(message.data), topic, camera)
@@ -50,7 +50,7 @@ def read_depth_message(
 ) -> Float32:
     """Depth (H, W) in metres, 0 = no reading, of an Image or a CompressedImage (compressedDepth).
 
-    Values without end and below 0 are no readings. ``scale``, the value for one metre, is by
+    Infinite, NaN and negative values count as no reading. ``scale``, the value per metre, is by
     default that of the encoding.
 
     Raises:
@@ -86,13 +86,13 @@ def _raw(message: Any, topic: str, camera: Intrinsics, dtype: str, channels: int
 
 
 def _decompressed(message: Any, topic: str, camera: Intrinsics, is_inverse: bool) -> Float32:
-    """Values (H, W) of image_transport's compressedDepth: PNG, of 32FC1 quantised 1 / depth."""
+    """Values (H, W) of image_transport's compressedDepth: PNG, quantised 1 / depth for 32FC1."""
     data = bytes(message.data)
     codec = re.search(r"compressedDepth\s*(\w*)", message.format)
-    if codec is not None and codec[1] not in ("", "png"):  # before 2021 it was not named
+    if codec is not None and codec[1] not in ("", "png"):  # not named before 2021
         wanted = ["16UC1; compressedDepth png", "32FC1; compressedDepth png"]
         raise unknown(f"format of depth in {topic}", message.format, wanted)
-    is_plain = data[:4] == b"\x89PNG"  # by tools that leave the header out
+    is_plain = data[:4] == b"\x89PNG"  # written by tools that omit the header
     values = decode_depth(data if is_plain else data[_DEPTH_HEADER:], topic, camera)
     found = values.astype(np.float32)
     if not is_inverse:

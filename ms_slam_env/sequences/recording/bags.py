@@ -1,7 +1,7 @@
-"""ROS 1 bags, ROS 2 bags and MCAP files, through the ``rosbags`` library; no ROS is needed.
+"""ROS 1 bags, ROS 2 bags and MCAP files, through the ``rosbags`` library; needs no ROS.
 
-Messages are decoded by the library's own definitions of the standard types, never by those that
-stand in the file.
+Messages are decoded with the library's definitions of the standard types, never with those in the
+file.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from ms_slam_env.sequences.recording.recording import Entry, Recording
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate, say_few_pairs
 
 SUFFIXES = (".bag", ".mcap", ".db3")
-"""Endings of the names of bags; a ROS 2 bag is also a folder with a ``metadata.yaml``."""
+"""Suffixes of bag files; a ROS 2 bag may also be a folder with a ``metadata.yaml``."""
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = ("sensor_msgs/msg/CameraInfo",)
@@ -59,23 +59,23 @@ _TRUTH = r"ground|truth|(^|[/_])gt([/_]|$)|vicon|mocap|optitrack"
 
 @dataclass(frozen=True)
 class Topics:
-    """Which topics of a bag are read; those left out are found by their type and name."""
+    """Topics of a bag to read; omitted ones are found by type and name."""
 
     depth: str | None = None
-    """Depth images: by default the one topic of images named depth, registered or aligned if there
-    are several."""
+    """Depth images; by default the image topic named depth, or among several the one named
+    registered or aligned."""
     color: str | None = None
-    """Colour images: by default the one that is named so. Where its frame or its CameraInfo is not
-    that of depth, colour is brought into the depth camera by /tf_static."""
+    """Colour images; by default the image topic named so. If its frame or CameraInfo differs from
+    that of depth, colour is registered to the depth camera by /tf_static."""
     info: str | None = None
-    """CameraInfo of the depth images: by default camera_info beside them, or the only one."""
+    """CameraInfo of the depth images; by default camera_info beside them, or the only one."""
     pose: str | None = None
     """True poses of the camera (optical frame), PoseStamped, PoseWithCovarianceStamped,
-    TransformStamped or Odometry: by default one whose name says ground truth, vicon or mocap."""
+    TransformStamped or Odometry; by default the topic named ground truth, vicon or mocap."""
 
 
 def is_bag(path: str | Path) -> bool:
-    """Whether a path is that of a bag: an existing file, or the folder of a ROS 2 bag."""
+    """Whether a path is a bag: an existing file, or the folder of a ROS 2 bag."""
     given = Path(path)
     is_file = given.suffix in SUFFIXES and given.is_file()
     return is_file or is_named(given / "metadata.yaml")
@@ -83,7 +83,7 @@ def is_bag(path: str | Path) -> bool:
 
 @dataclass(frozen=True)
 class Address:
-    """Where a message is: its topic, the time at which it was recorded, and which one of it."""
+    """Address of a message: its topic, recording time, and index among messages of that time."""
 
     topic: str
     recorded_ns: int
@@ -91,18 +91,18 @@ class Address:
 
 
 class Bag:
-    """Messages of a bag, which is opened when the first one is asked for."""
+    """The messages of a bag, which is opened on first use."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def __reduce__(self) -> tuple[type[Bag], tuple[Path]]:
-        """Open it anew elsewhere."""
+        """Pickle only the path; the bag is opened again elsewhere."""
         return Bag, (self.path,)
 
     @cached_property
     def _opened(self) -> tuple[Any, Any]:
-        """The library's reader, and what decodes a message of a type."""
+        """The library's reader, and its message decoder."""
         try:
             from rosbags import rosbag1, rosbag2
             from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -125,7 +125,7 @@ class Bag:
 
     @contextmanager
     def refusing(self, what: str = "") -> Iterator[None]:
-        """Turn whatever the library raises at a damaged file into one line."""
+        """Turn any error of the library on a damaged file into one line."""
         try:
             yield
         except InputError:
@@ -136,7 +136,7 @@ class Bag:
 
     @cached_property
     def types(self) -> dict[str, str]:
-        """Topic to type of its messages."""
+        """Message type by topic."""
         with self.refusing():
             return {str(c.topic): str(c.msgtype) for c in self._opened[0].connections}
 
@@ -154,8 +154,8 @@ class Bag:
     def index(self, topic: str) -> tuple[Float64, list[Address]]:
         """Times (N,) in seconds, increasing, and addresses of the messages of a topic.
 
-        A time is that of the header, or where these are all 0 that of recording; of several
-        messages of one time the first is taken.
+        A time is that of the header, or of recording if all headers are 0. Of several messages with
+        the same time the first is used.
         """
         is_first, is_stamped = self.path.suffix == ".bag", self._is_stamped(topic)
         found: dict[float, Address] = {}
@@ -178,20 +178,20 @@ class Bag:
             yield _stamp(data, is_first) if is_stamped else 1e-9 * recorded, message
 
     def _is_stamped(self, topic: str) -> bool:
-        """Whether headers say the time; a simulated clock may begin at 0."""
+        """Whether headers contain the time; a simulated clock may start at 0."""
         is_first = self.path.suffix == ".bag"
         return any(_stamp(data, is_first) for _, data in self._messages(topic))
 
     @cached_property
     def transforms(self) -> Transforms:
-        """What ``/tf_static`` says."""
+        """Transforms from ``/tf_static``."""
         if _TF_STATIC not in self.of_types(TRANSFORMS):
             return {}
         with self.refusing(f", topic {_TF_STATIC}"):
             return transforms_of(self.messages(_TF_STATIC), _TF_STATIC)
 
     def read(self, address: Address) -> Any:
-        """The message at an address, decoded."""
+        """Decode the message at an address."""
         span = address.recorded_ns, address.recorded_ns + 1
         for number, (_, data) in enumerate(self._messages(address.topic, *span)):
             if number == address.number:
@@ -201,7 +201,7 @@ class Bag:
 
 
 def _check_profile(path: Path) -> None:
-    """Refuse an MCAP file of others' messages in a line that says what to do."""
+    """Refuse an MCAP file with non-ROS messages, and say what to do."""
     with open(path, "rb") as file:
         start = file.read(64)
     profile = start[21 : 21 + int.from_bytes(start[17:21], "little")].decode(errors="replace")
@@ -213,25 +213,25 @@ def _check_profile(path: Path) -> None:
 
 
 def _stamp(data: bytes, is_first: bool) -> float:
-    """Seconds in the header that every message in question begins with; 0 where there is none."""
+    """Seconds in the header at the start of these messages; 0 if there is none."""
     if len(data) < 12:
         return 0.0
-    if is_first:  # number, seconds, nanoseconds
+    if is_first:  # sequence number, seconds, nanoseconds
         seconds, nanoseconds = struct.unpack_from("<II", data, 4)
-    else:  # four bytes about the encoding before
+    else:  # preceded by four bytes about the encoding
         seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return float(seconds) + 1e-9 * nanoseconds
 
 
 @dataclass(frozen=True)
 class BagEntry(Entry):
-    """A frame of two messages; its paths are names only.
+    """A frame of two messages; its paths are only names.
 
     Attributes:
-        bag: where they are.
-        depth_at: the depth image.
-        color_at: the colour image; None without colour.
-        depth_scale: value of a depth image for one metre; None as its encoding says.
+        bag: bag of the messages.
+        depth_at: address of the depth image.
+        color_at: address of the colour image; None without colour.
+        depth_scale: depth image value per metre; None for that of its encoding.
     """
 
     bag: Bag
@@ -260,14 +260,13 @@ def open_bag(
     topics: Topics | None = None,
     is_registration_given: bool = False,
 ) -> Recording:
-    """Frames of the depth topic, each with the colour image of its time.
+    """Open a bag: the frames of the depth topic, each with the colour image of the same time.
 
-    Where images of depth and colour say that they are of two cameras, colour is brought into the
-    depth camera, unless ``is_registration_given``.
+    If depth and colour images name different cameras, colour is registered to the depth camera,
+    unless ``is_registration_given``.
 
     Raises:
-        InputError: no such topic, none or several that may be meant, no calibration, or a file
-            that cannot be read.
+        InputError: no such topic, no candidate or several, no calibration, or an unreadable file.
     """
     bag, given = Bag(path), topics or Topics()
     depth_topic = given.depth or _depth_topic(bag)
@@ -317,13 +316,13 @@ def open_bag(
 
 
 def _frame(bag: Bag, address: Address) -> str:
-    """The frame that a message says it is of."""
+    """The frame named in a message."""
     message = bag.read(address)
     return str(message.header.frame_id)
 
 
 def _info_beside(topic: str) -> str:
-    """The topic where the calibration of a topic of images belongs."""
+    """The calibration topic that belongs to an image topic."""
     parts = [part for part in topic.split("/") if part not in _TRANSPORTS]
     return "/".join([*parts[:-1], "camera_info"])
 
@@ -351,7 +350,7 @@ def _color_topic(bag: Bag, depth: str) -> str | None:
 
 
 def _best(bag: Bag, name: str, topics: list[str], preferred: str) -> str:
-    """The only topic, or the only one of those with the best name; raw before compressed."""
+    """The only topic, or the only one with the best name; raw is preferred to compressed."""
 
     def rank(topic: str) -> tuple[bool, bool]:
         is_raw = bag.types[topic] == IMAGES[0]
@@ -366,7 +365,7 @@ def _best(bag: Bag, name: str, topics: list[str], preferred: str) -> str:
 
 
 def _camera(bag: Bag, depth: str, given: str | None) -> Intrinsics:
-    """What the CameraInfo of the depth images says."""
+    """Intrinsics from the CameraInfo of the depth images."""
     beside, all_of_them = _info_beside(depth), bag.of_types(INFO)
     if given is not None:
         _check_topic(bag, "info", given, INFO)
@@ -383,7 +382,7 @@ def _camera(bag: Bag, depth: str, given: str | None) -> Intrinsics:
 
 
 def _read_camera(bag: Bag, given: str, images: str) -> Intrinsics:
-    """What the first message of a topic of CameraInfo says of a topic of images."""
+    """Intrinsics for an image topic from the first message of a CameraInfo topic."""
     parts = [part for part in images.split("/") if part not in _TRANSPORTS]
     message = next((message for _, message in bag.messages(given)), None)
     if message is None:
@@ -393,7 +392,7 @@ def _read_camera(bag: Bag, given: str, images: str) -> Intrinsics:
 
 
 def _intrinsics(message: Any, is_rectified: bool) -> Intrinsics:
-    """Intrinsics of a CameraInfo: K and D; P and no lens where images are rectified."""
+    """Intrinsics of a CameraInfo: K and D, or P without distortion if images are rectified."""
     names = ("K", "D", "P") if hasattr(message, "K") else ("k", "d", "p")  # ROS 1, ROS 2
     K, D, P = ([float(v) for v in getattr(message, name)] for name in names)
     size = int(message.width), int(message.height)
@@ -432,7 +431,7 @@ def _truth(bag: Bag, given: str | None, camera: str) -> tuple[Float64, Float64] 
 
 
 def _pose(message: Any, topic: str) -> Float64:
-    """Pose (4, 4) of a message of one of `POSES`."""
+    """Pose (4, 4) of a message with a type in `POSES`."""
     found = message.transform if hasattr(message, "transform") else message.pose
     found = getattr(found, "pose", found)
     t = getattr(found, "translation", None) or found.position

@@ -1,4 +1,4 @@
-"""EuRoC MAV, ASL format: two cameras with lenses, ``mav0/cam0`` and ``cam1``; also TUM-VI."""
+"""EuRoC MAV and TUM-VI, in ASL format: two distorted cameras, ``mav0/cam0`` and ``cam1``."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _SAME_SHUTTER_S = 0.002
 
 
 def is_euroc(folder: Path) -> bool:
-    """Whether a folder is laid out so."""
+    """Whether a folder has this layout."""
     return is_named(folder / "mav0") or is_named(folder / "cam0" / "data.csv")
 
 
 def open_euroc(folder: Path, intrinsics: Calibration | None) -> Recording:
-    """The rectified left camera with depth by stereo matching; truth is its pose.
+    """Open the rectified left camera with depth by stereo matching; true poses are its own.
 
     Raises:
-        InputError: intrinsics given; a file that is missing or does not parse.
+        InputError: intrinsics were given; a file is missing or invalid.
     """
     if intrinsics is not None:
         raise InputError(f"{folder}: the calibration of EuRoC is that of its sensor.yaml files")
@@ -82,7 +82,7 @@ def _listed(camera: Path) -> list[tuple[float, Path, str]]:
 
 
 def _sensor(path: Path) -> dict[str, Any]:
-    """What a ``sensor.yaml`` says; its first line may be OpenCV's ``%YAML:1.0``."""
+    """Read a ``sensor.yaml``; its first line may be OpenCV's ``%YAML:1.0``."""
     try:
         read = load_yaml(re.sub(r"\A%YAML.*\n", "", read_text(path, "calibration")))
     except ValueError as error:
@@ -103,7 +103,7 @@ def _numbers(sensor: dict[str, Any], key: str, count: int | None, path: Path) ->
 
 
 def _pose(sensor: dict[str, Any], path: Path) -> Float64:
-    """T_body_sensor (4, 4); rounded by hand, as files have it, to a rigid motion."""
+    """T_body_sensor (4, 4), made exactly rigid because files round it."""
     given = sensor.get("T_BS")
     if not isinstance(given, dict):
         raise InputError(f"{path}: T_BS, the pose of the sensor, is missing")
@@ -112,7 +112,7 @@ def _pose(sensor: dict[str, Any], path: Path) -> Float64:
 
 
 def _camera(folder: Path) -> tuple[Intrinsics, Float64]:
-    """Intrinsics and T_body_camera (4, 4) of ``sensor.yaml``."""
+    """Intrinsics and T_body_camera (4, 4) from ``sensor.yaml``."""
     path = folder / "sensor.yaml"
     sensor = _sensor(path)
     if sensor.get("camera_model") != "pinhole":
@@ -130,7 +130,7 @@ def _camera(folder: Path) -> tuple[Intrinsics, Float64]:
 
 
 def _truth(inside: Path) -> tuple[Float64, Float64] | tuple[None, None]:
-    """Times (M,) and T_world_body (M, 4, 4) of the first of `_TRUTH` that there is."""
+    """Times (M,) and T_world_body (M, 4, 4) from the first existing file of `_TRUTH`."""
     for name in _TRUTH:
         path = inside / name / "data.csv"
         if is_named(path):
@@ -143,7 +143,7 @@ def _truth(inside: Path) -> tuple[Float64, Float64] | tuple[None, None]:
 
 
 def _states(path: Path) -> tuple[Float64, Float64]:
-    """Lines ``timestamp_ns, x, y, z, qw, qx, qy, qz`` and whatever follows."""
+    """Read lines ``timestamp_ns, x, y, z, qw, qx, qy, qz``, ignoring further columns."""
     times: list[float] = []
     poses: list[Float64] = []
     for where, words in rows(path):

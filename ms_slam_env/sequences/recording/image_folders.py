@@ -1,4 +1,4 @@
-"""Frames of the plain layout: a folder of depth images and, if there is colour, one of these."""
+"""Frames of the plain layout: a folder of depth images and an optional one of colour images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ms_slam_env.sequences.recording.recording import Entry
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, UNITS, say_unit, unit_of
 
 FRAME_RATE_HZ = 30.0
-"""Where a layout has no times."""
+"""Frame rate of a layout without times."""
 
 COLOR_FOLDERS = ("rgb", "color", "colour", "image", "images", "img")
 TIMES_FILES = ("times.txt", "timestamps.txt")
@@ -26,19 +26,19 @@ _NO_COLOR = {"depth", "depth_true", "labels", "mask", "masks", "normals", "objec
 
 
 def folder_entries(folder: Path, truth_times: Float64 | None) -> list[Entry]:
-    """Frames of ``depth`` and of one of `COLOR_FOLDERS`, in the order of the numbers in the names.
+    """List the frames of ``depth`` and one of `COLOR_FOLDERS`, ordered by the numbers in names.
 
-    Their times are those of ``times.txt`` (`listed_times`), else what the names say: seconds with a
-    fraction, time since 1970 or another start in milli-, micro- or nanoseconds. Where names are
-    numbers of frames, they are those of the truth if it has one pose a frame, else at 30 Hz.
+    Times come from ``times.txt`` (`listed_times`), else from the names: seconds with a fraction, or
+    time since 1970 or another start in milli-, micro- or nanoseconds. If names are frame numbers,
+    the true trajectory's times are used if it has one pose per frame, else 30 Hz.
 
     Args:
-        folder: of the recording.
-        truth_times: (M,) seconds, of the true trajectory in the folder.
+        folder: folder of the recording.
+        truth_times: (M,) seconds of the true trajectory in the folder.
 
     Raises:
-        InputError: no images; not as many of colour as of depth, or of other numbers; times that
-            do not fit.
+        InputError: no images; colour and depth differ in number or numbering; times that do not
+            match.
     """
     depth = images(folder / "depth")
     color_folder = find_color(folder)
@@ -51,10 +51,10 @@ def folder_entries(folder: Path, truth_times: Float64 | None) -> list[Entry]:
 
 
 def images(folder: Path) -> list[Path]:
-    """Images of a folder in the order of the numbers in their names.
+    """List a folder's images, ordered by the numbers in their names.
 
     Raises:
-        InputError: no folder, or no image in it.
+        InputError: not a folder, or without images.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder of images")
@@ -68,12 +68,12 @@ def images(folder: Path) -> list[Path]:
 
 
 def find_color(folder: Path) -> Path | None:
-    """The folder of colour images, of any of the usual names; None without colour.
+    """Find the folder of colour images, by the usual names; None without colour.
 
-    Another folder with images is warned of, since it may hold the colour.
+    Warns of another folder with images, since it may hold the colour.
 
     Raises:
-        InputError: two of them.
+        InputError: there are two.
     """
     inside = sorted(path for path in folder.iterdir() if path.is_dir())
     found = [path for path in inside if path.name.lower() in COLOR_FOLDERS]
@@ -97,7 +97,7 @@ def _warn(text: str) -> None:
 
 
 def _paired(folder: Path, depth: list[Path], color: list[Path]) -> list[Path]:
-    """The colour image of each depth image: the one of its number, or all of a constant offset."""
+    """The colour image of each depth image: equal numbers, or a constant offset."""
     if len(color) != len(depth):
         raise InputError(f"{folder}: {len(depth)} depth images but {len(color)} colour images")
     ours, theirs = _numbers(depth), _numbers(color)
@@ -115,7 +115,7 @@ def _paired(folder: Path, depth: list[Path], color: list[Path]) -> list[Path]:
 
 
 def _numbers(paths: list[Path]) -> Float64 | None:
-    """Frame numbers (N,) at 30 Hz that names say, increasing; None where they say none."""
+    """Increasing frame numbers (N,) at 30 Hz from the names; None if there are none."""
     found, unit, _ = _said(paths)
     if found is None:
         return None
@@ -123,9 +123,9 @@ def _numbers(paths: list[Path]) -> Float64 | None:
 
 
 def _said(paths: list[Path]) -> tuple[Float64 | None, str | None, bool]:
-    """Numbers (N,) that names say, increasing, the unit of time that they have, if it is a guess.
+    """Increasing numbers (N,) in the names, their unit of time, and whether that is a guess.
 
-    Without a unit they are numbers of frames; None where names say none.
+    Without a unit they are frame numbers; None if the names have none.
     """
     stems = [path.stem for path in paths]
     are_seconds = all(re.fullmatch(r"\d{1,12}\.\d{1,12}", stem) for stem in stems)
@@ -139,7 +139,7 @@ def _said(paths: list[Path]) -> tuple[Float64 | None, str | None, bool]:
 
 
 def _whole_numbers(stems: list[str]) -> Float64 | None:
-    """Of names with one number that changes, such as ``cam0_00012_depth``, that number."""
+    """The only number that varies among the names, such as 12 in ``cam0_00012_depth``."""
     words = [re.findall(r"\d{1,20}", stem) for stem in stems]
     if len({len(word) for word in words}) != 1:
         return None
@@ -151,7 +151,7 @@ def _whole_numbers(stems: list[str]) -> Float64 | None:
 
 
 def _times(folder: Path, depth: list[Path], truth_times: Float64 | None) -> Float64:
-    """Seconds (N,) of the frames."""
+    """Times (N,) of the frames in seconds."""
     for name in TIMES_FILES:
         if is_named(folder / name):
             return listed_times(folder / name, [path.stem for path in depth])

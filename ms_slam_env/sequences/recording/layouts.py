@@ -72,14 +72,14 @@ def _calibration_of(
     whose: str = "",
     depth: Path | None = None,
 ) -> Calibration:
-    """The user's, the folder's, or the published calibration of the dataset, in that order.
+    """The user's, the folder's, or the dataset's published calibration, in that order.
 
     Args:
-        folder: of the recording.
-        given: by the user.
-        known: published.
-        whose: dataset that it is the published one of.
-        depth: a depth image, which a file without its size is of.
+        folder: folder of the recording.
+        given: calibration from the user.
+        known: published calibration.
+        whose: dataset of the published calibration.
+        depth: a depth image, which gives the size if the file does not.
     """
     if given is not None:
         return given
@@ -102,7 +102,7 @@ def _calibration_of(
 
 
 def _camera_parameters(path: Path) -> Calibration:
-    """Calibration of a ``cam_params.json`` of Replica."""
+    """Read the calibration from Replica's ``cam_params.json``."""
     read = read_json(path, "calibration")
     camera = read.get("camera") if isinstance(read, dict) else None
     keys = ("fx", "fy", "cx", "cy", "w", "h", "scale")
@@ -117,7 +117,7 @@ def _say(text: str) -> None:
 
 
 def _pairs(folder: Path) -> list[Entry]:
-    """Frames from ``associations.txt``, or from ``depth.txt`` and ``rgb.txt`` by their times."""
+    """List frames from ``associations.txt``, or from ``depth.txt`` and ``rgb.txt`` by time."""
     for name in ("associations.txt", "association.txt"):
         if is_named(folder / name):
             return _associations(folder / name)
@@ -136,7 +136,7 @@ def _pairs(folder: Path) -> list[Entry]:
 
 
 def _expect_no_color(folder: Path) -> None:
-    """Refuse a folder without ``rgb.txt`` where there is colour, or should be."""
+    """Refuse a folder without ``rgb.txt`` that has colour, or should have it."""
     color = find_color(folder)
     if color is not None:
         raise InputError(f"{folder / 'rgb.txt'} is missing, which lists the images of {color.name}")
@@ -144,7 +144,7 @@ def _expect_no_color(folder: Path) -> None:
 
 
 def _expect_all_files(folder: Path, name: str) -> None:
-    """Refuse a generated sequence that has lost a file."""
+    """Refuse a generated sequence with a missing file."""
     if is_named(folder / DESCRIPTION):
         raise InputError(f"{folder / name} is missing; every generated sequence has one")
 
@@ -154,7 +154,7 @@ def _times(images: list[Listed]) -> Float64:
 
 
 def _associations(path: Path) -> list[Entry]:
-    """Lines ``time file time file``; the file whose path contains "depth" is the depth image."""
+    """Read lines ``time file time file``; the path containing "depth" is the depth image."""
     entries = []
     for where, words in rows(path):
         if len(words) != 4:
@@ -206,9 +206,9 @@ def _recording(folder: Path, layout: str, entries: list[Entry], camera: Calibrat
 def open_seven_scenes(folder: Path, intrinsics: Calibration | None) -> Recording:
     """7-Scenes: ``frame-NNNNNN.color.png`` (or JPEG), ``.depth.png`` in millimetres, ``.pose.txt``.
 
-    Colour and depth are the raw images of two cameras, so colour is registered by default, with
-    the numbers of ``Registration``. With a ``camera-intrinsics.txt`` they are those of 3DMatch,
-    which are registered.
+    Colour and depth are the raw images of two cameras, so colour is registered by default, with the
+    defaults of ``Registration``. With a ``camera-intrinsics.txt`` they come from 3DMatch and are
+    already registered.
     """
     first = min(folder.glob("frame-*.depth.png"), default=None)
     known = SEVEN_SCENES_CAMERA, "7-Scenes", first
@@ -240,11 +240,11 @@ def open_seven_scenes(folder: Path, intrinsics: Calibration | None) -> Recording
 
 
 def open_folder(folder: Path, intrinsics: Calibration | None) -> Recording:
-    """Folders ``depth`` and, if there is colour, ``rgb``, ``color`` or the like.
+    """Plain folders: ``depth`` and, with colour, ``rgb``, ``color`` or a similar name.
 
-    True poses are those of ``groundtruth.txt``, or one a frame: of ``pose/NUMBER.txt`` (ScanNet) or
-    the lines of ``traj.txt`` (Replica). ScanNet's colour, of another camera, is brought into the
-    depth camera.
+    True poses come from ``groundtruth.txt``, or one per frame from ``pose/NUMBER.txt`` (ScanNet) or
+    the lines of ``traj.txt`` (Replica). ScanNet's colour comes from another camera and is
+    registered to the depth camera.
     """
     depth = images(folder / "depth")
     camera = _calibration_of(folder, intrinsics, depth=depth[0])
@@ -259,7 +259,7 @@ def open_folder(folder: Path, intrinsics: Calibration | None) -> Recording:
 
 
 def open_replica(folder: Path, intrinsics: Calibration | None) -> Recording:
-    """Replica as NICE-SLAM has it: ``results/depthNNNNNN.png`` and ``frameNNNNNN.jpg``.
+    """Replica in the form of NICE-SLAM: ``results/depthNNNNNN.png`` and ``frameNNNNNN.jpg``.
 
     True poses are the lines of ``traj.txt``, the calibration is ``cam_params.json`` beside them or
     in the folder above.
@@ -288,7 +288,7 @@ def _check_scale(folder: Path, camera: Calibration) -> None:
 
 
 def _with_poses(folder: Path, recording: Recording) -> Recording:
-    """A recording with the true poses that a folder has one a frame, if it has any."""
+    """Add a folder's true poses, one per frame, if it has any."""
     times = recording.timestamps
     if is_named(folder / "pose"):
         by_number = {_number(path): path for path in (folder / "pose").glob("*.txt")}
@@ -306,7 +306,7 @@ def _with_poses(folder: Path, recording: Recording) -> Recording:
 
 
 def _number(path: Path) -> int:
-    """The last number in a name; -1 without one."""
+    """The last number in a name; -1 if there is none."""
     return int((re.findall(r"\d{1,18}", path.stem) or [-1])[-1])
 
 
@@ -320,7 +320,7 @@ LAYOUTS: dict[str, Callable[[Path, Calibration | None], Recording]] = {
     "kitti": open_kitti,
     "bag": open_bag,
 }
-"""Name of a layout to its reader."""
+"""Reader of each layout."""
 
 
 _TELLING = re.compile(
@@ -338,11 +338,11 @@ _READ = {
     "replica": ("intrinsics.txt", "cam_params.json", "traj.txt"),
     "kitti": ("calib.txt", "times.txt", "poses.txt"),
 }
-"""Layout to the names in its folder, of those that are `_TELLING`, that are read."""
+"""Names matching `_TELLING` that each layout reads."""
 
 
 def _say_what_is_not_read(folder: Path, layout: str) -> None:
-    """Name the files that may say something of calibration, time or truth, and are not read."""
+    """Warn of unread files that may contain calibration, times or true poses."""
     if layout not in _READ:
         return
     found = (path.name for path in folder.iterdir() if path.suffix != ".freiburg")
@@ -358,7 +358,7 @@ def _say_what_is_not_read(folder: Path, layout: str) -> None:
 
 
 def _recognise(folder: Path) -> str:
-    """The layout of a folder, by the files in it."""
+    """Recognise a folder's layout by its files."""
     for layout, is_it in (("bag", is_bag), ("euroc", is_euroc), ("kitti", is_kitti)):
         if is_it(folder):
             return layout
@@ -391,19 +391,17 @@ def open_recording(
     """Open a recorded sequence; images are read later, frame by frame.
 
     Args:
-        path: its folder or bag, or those of its parts in order, joined by commas (`join_parts`).
+        path: its folder or bag, or those of its parts in order, separated by commas (`join_parts`).
         layout: ``auto`` or one of ``LAYOUTS``.
-        intrinsics: of the images on disk, with the scale of the depth images or without; by
-            default those of ``intrinsics.txt`` in the folder, else the published ones of the
-            dataset.
-        register: whether to bring colour into the depth camera, with the numbers of an
-            uncalibrated Kinect or with those given; by default only the layout 7-Scenes does,
-            whose images are not registered.
-        topics: of a bag; by default found by type and name.
+        intrinsics: intrinsics of the images on disk, with or without the depth scale; by default
+            those of ``intrinsics.txt`` in the folder, else the dataset's published ones.
+        register: whether to register colour to the depth camera, with the values of an uncalibrated
+            Kinect or the given ones; by default only for 7-Scenes, whose images are not registered.
+        topics: topics of a bag; by default found by type and name.
 
     Raises:
-        InputError: no such folder, bag or layout, a sequence that was not written to its end,
-            intrinsics missing, a listing that does not parse, parts that do not fit together.
+        InputError: no such folder, bag or layout, an incompletely written sequence, missing
+            intrinsics, an invalid listing, parts that do not match.
     """
     parts = part_folders(path)
     if len(parts) > 1:

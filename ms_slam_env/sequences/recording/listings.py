@@ -19,19 +19,19 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
 from ms_slam_env.sequences.trajectory import in_seconds, said_unit, say_unit, unit_of
 
-_ROUNDED = 1e-2  # as for the length of a quaternion
+_ROUNDED = 1e-2  # tolerance, as for the length of a quaternion
 
 CALIBRATION = (
     "fx fy cx cy width height [depth_scale] "
     "[radial-tangential k1 k2 p1 p2 k3 | equidistant k1 k2 k3 k4 | "
     "rational k1 k2 p1 p2 k3 k4 k5 k6]"
 )
-"""What a calibration says; a lens is that of both images."""
+"""Fields of a calibration; distortion applies to both images."""
 
 
 @dataclass(frozen=True)
 class Listed:
-    """A file with its time and the line that lists it."""
+    """A file with its time, and the line that lists it."""
 
     timestamp: float
     path: Path
@@ -39,19 +39,19 @@ class Listed:
 
 
 def rows(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Yield (``file:line``, words) of every line that has any and is no comment.
+    """Yield (``file:line``, words) of every line that is neither empty nor a comment.
 
     Raises:
         InputError: the file cannot be read.
     """
     for where, line in _lines(path):
         words = words_of(line)
-        if words:  # a line of separators has none
+        if words:  # a line of only separators has none
             yield where, words
 
 
 def _lines(path: Path, comments: list[str] | None = None) -> Iterator[tuple[str, str]]:
-    """Yield (``file:line``, text) of every line, without its comment, that says something."""
+    """Yield (``file:line``, text) of every nonempty line, without its comment."""
     for number, line in enumerate(read_text(path, "listing").splitlines(), start=1):
         text, mark, comment = re.match(r"(.*?)((?:^|(?<=\s))#|$)(.*)", line).groups()  # type: ignore[union-attr]
         if mark and comments is not None:
@@ -61,10 +61,10 @@ def _lines(path: Path, comments: list[str] | None = None) -> Iterator[tuple[str,
 
 
 def number(word: str, where: str) -> float:
-    """Read a finite number.
+    """Parse a finite number.
 
     Raises:
-        InputError: naming file and line.
+        InputError: it names file and line.
     """
     try:
         value = float(word)
@@ -76,12 +76,12 @@ def number(word: str, where: str) -> float:
 
 
 def listed_images(path: Path) -> list[Listed]:
-    """Lines ``timestamp filename``, times increasing, files relative to the listing's folder.
+    """Read lines ``timestamp filename``: increasing times, files relative to the folder.
 
-    A name with blanks stands in quotation marks.
+    A name with blanks is in quotation marks.
 
     Raises:
-        InputError: naming file and line.
+        InputError: it names file and line.
     """
     found: list[Listed] = []
     comments: list[str] = []
@@ -107,14 +107,14 @@ _NAME_AND_TIME = re.compile(r"""([^\s;,]+(?:,\d+(?=\s))?)[\s;,]+(?:"([^"]+)"|([^
 
 
 def listed_times(path: Path, names: Sequence[str]) -> Float64:
-    """Seconds (N,) of images from lines ``time``, or ``id time [exposure]`` as TUM-VI has them.
+    """Read image times (N,) in seconds from lines ``time``, or TUM-VI's ``id time [exposure]``.
 
     Args:
-        path: of the file; a comment may name the unit of time, as ``[ns]``.
-        names: N names of images without ending; an id is one of them.
+        path: path of the file; a comment may name the unit of time, as ``[ns]``.
+        names: N image names without suffix; an id is one of them.
 
     Raises:
-        InputError: naming file and line; not as many lines as images.
+        InputError: it names file and line; or the numbers of lines and images differ.
     """
     comments: list[str] = []
     lines = [(where, words_of(line)) for where, line in _lines(path, comments)]
@@ -132,7 +132,7 @@ def listed_times(path: Path, names: Sequence[str]) -> Float64:
     found = np.array(times)
     said = next(filter(None, map(said_unit, comments)), None)
     step = float(np.median(np.diff(found))) if len(found) > 1 else 0.0
-    if not said and unit_of(found)[0] == "s" and step >= 2:  # no camera's seconds
+    if not said and unit_of(found)[0] == "s" and step >= 2:  # too far apart for seconds
         said = "ms"
         say_unit(said, found, path, "a comment such as [s]")
     return in_seconds(found, path, said)
@@ -148,11 +148,11 @@ def _is_id(word: str, name: str) -> bool:
 def read_pose(path: Path) -> Float64 | None:
     """Read a pose (4, 4) T_world_camera written as four rows of four numbers.
 
-    A rotation that is orthonormal but for rounding is made so exactly. None where all is ``-inf``,
-    as ScanNet has it where the pose is not known.
+    A rotation that is orthonormal up to rounding is made exactly so. None if all values are
+    ``-inf``, as in ScanNet for unknown poses.
 
     Raises:
-        InputError: another shape, NaN, or no rigid motion.
+        InputError: a wrong shape, NaN, or not a rigid motion.
     """
     if [words for _, words in rows(path)] == 4 * [4 * ["-inf"]]:
         return None
@@ -160,10 +160,10 @@ def read_pose(path: Path) -> Float64 | None:
 
 
 def _read_matrix(path: Path, sides: Sequence[int]) -> Float64:
-    """Read a square matrix of one of some sizes.
+    """Read a square matrix of one of the sizes ``sides``.
 
     Raises:
-        InputError: another shape, or what is no finite number.
+        InputError: a wrong shape, or something that is not a finite number.
     """
     values = [[number(word, where) for word in words] for where, words in rows(path)]
     if len(values) not in sides or any(len(row) != len(values) for row in values):
@@ -173,10 +173,10 @@ def _read_matrix(path: Path, sides: Sequence[int]) -> Float64:
 
 
 def read_poses(path: Path, count: int) -> Float64:
-    """Read poses (N, 4, 4), one a line and frame, of 16 numbers or of 12 without the last row.
+    """Read poses (N, 4, 4), one line per frame, with 16 numbers or 12 without the last row.
 
     Raises:
-        InputError: naming file and line; not as many as ``count`` frames.
+        InputError: it names file and line; or there are not ``count`` poses.
     """
     poses = []
     for where, words in rows(path):
@@ -191,10 +191,10 @@ def read_poses(path: Path, count: int) -> Float64:
 
 
 def read_camera_matrix(path: Path, image: Path) -> Intrinsics:
-    """Intrinsics of a file of a matrix (3, 3) or (4, 4), for images as large as ``image``.
+    """Read intrinsics from a matrix (3, 3) or (4, 4), for images of the size of ``image``.
 
     Raises:
-        InputError: naming the file.
+        InputError: it names the file.
     """
     K = _read_matrix(path, (3, 4))
     try:
@@ -204,7 +204,7 @@ def read_camera_matrix(path: Path, image: Path) -> Intrinsics:
 
 
 def rigid(matrix: Float64) -> Float64:
-    """A pose (4, 4) whose rotation, orthonormal but for rounding, is made so exactly."""
+    """Make a pose's rotation, orthonormal up to rounding, exactly so."""
     if np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() < _ROUNDED:
         left, _, right = np.linalg.svd(matrix[:3, :3])  # the nearest orthonormal matrix
         matrix[:3, :3] = left @ right
@@ -213,12 +213,12 @@ def rigid(matrix: Float64) -> Float64:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What ``intrinsics.txt`` says.
+    """Content of ``intrinsics.txt``.
 
     Attributes:
-        intrinsics: with positive focal lengths, of the images on disk.
-        flipped: fy was negative: the camera frame of the poses has y up.
-        depth_scale: value of a depth image for one metre; None where the file does not say.
+        intrinsics: intrinsics of the images on disk, with positive focal lengths.
+        flipped: whether fy was negative: the camera frame of the poses has y up.
+        depth_scale: depth image value per metre; None if not given.
     """
 
     intrinsics: Intrinsics
@@ -227,10 +227,10 @@ class Calibration:
 
 
 def read_intrinsics(path: Path) -> Calibration:
-    """Read a `CALIBRATION`.
+    """Read a file `CALIBRATION`.
 
     Raises:
-        InputError: naming file and line.
+        InputError: it names file and line.
     """
     for where, words in rows(path):
         return parse_calibration(words, where)
@@ -238,10 +238,10 @@ def read_intrinsics(path: Path) -> Calibration:
 
 
 def parse_calibration(words: Sequence[str], where: str) -> Calibration:
-    """Calibration of the words of `CALIBRATION`.
+    """Parse the words of `CALIBRATION`.
 
     Raises:
-        InputError: naming ``where`` they stand.
+        InputError: it names ``where``, their origin.
     """
     models = (*NAMES, *ALIASES)
     end = next((k for k, word in enumerate(words) if word in models), len(words))
@@ -268,7 +268,7 @@ def calibration(
     height: float,
     depth_scale: float | None = None,
 ) -> Calibration:
-    """Intrinsics whose fy may be negative, as ICL-NUIM states them."""
+    """Make a calibration; fy may be negative, as in ICL-NUIM."""
     if depth_scale is not None and not depth_scale > 0:
         raise InputError(f"depth_scale = {depth_scale} must be above 0")
     intrinsics = Intrinsics(fx, abs(fy), cx, cy, round(width), round(height))
@@ -276,9 +276,9 @@ def calibration(
 
 
 def flip_y(poses: Float64) -> Float64:
-    """Poses (N, 4, 4) of cameras with y up in a left-handed world, as seen in a mirror.
+    """Mirror poses (N, 4, 4) of cameras with y up in a left-handed world.
 
-    The mirror y -> -y in both frames turns them into right-handed poses of cameras with y down.
+    The reflection y -> -y in both frames gives right-handed poses of cameras with y down.
     """
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
     return mirror @ poses @ mirror

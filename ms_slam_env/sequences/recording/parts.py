@@ -1,4 +1,4 @@
-"""A recording that lies in several folders, one part after the other."""
+"""Recordings in several folders, one part after another."""
 
 from __future__ import annotations
 
@@ -18,25 +18,26 @@ SEPARATOR = ","
 
 
 def is_recording(path: str | Path) -> bool:
-    """Whether a path is that of a folder or a bag."""
+    """Whether a path is a folder or a bag."""
     return os.path.isdir(path) or is_bag(path)
 
 
 def part_folders(text: str | Path) -> list[str]:
-    """The folders or bags of a recording ``FOLDER[,FOLDER ...]``: one where one has that name."""
+    """The folders or bags of a recording ``FOLDER[,FOLDER ...]``; an existing name is not split."""
     parts = str(text).split(SEPARATOR)
     is_one = is_recording(text) or not all(is_recording(part) for part in parts)
     return [str(text)] if is_one else parts
 
 
 def join_parts(parts: Sequence[Recording]) -> Recording:
-    """One recording of all frames. A part whose times do not go on from the part before it, as
-    where each begins at 0, begins one median interval after its last frame; the truth goes with it.
+    """Join parts into one recording.
 
-    Its name is that of the first part, with the number of parts.
+    If a part's times do not continue those of the part before, for example because each starts at
+    0, it is shifted to start one median interval after that part's last frame, together with its
+    true poses. The name is that of the first part with the number of parts.
 
     Raises:
-        InputError: parts of different cameras, or of which only some have colour or truth.
+        InputError: the parts have different cameras, or only some have colour or true poses.
     """
     first = parts[0]
     for part in parts[1:]:
@@ -61,7 +62,7 @@ def join_parts(parts: Sequence[Recording]) -> Recording:
     if times is not None and poses is not None:
         times, order = np.unique(times, return_index=True)
         poses = poses[order]
-        if not len(times):  # all before or after the frames
+        if not len(times):  # all are before or after the frames
             times = poses = None
     name = f"{first.name}_and_{len(parts) - 1}_more"
     return dataclasses.replace(
@@ -76,7 +77,7 @@ def _interval(times: Sequence[Float64]) -> float:
 
 
 def _truth(part: Recording, shift: float, margin: float) -> list[tuple[Float64, Float64]]:
-    """Times and true poses from the part's first frame to its last, if it has any."""
+    """Times and true poses from the part's first to its last frame, if it has any."""
     if part.truth_times is None or part.truth is None:
         return []
     first, last = part.timestamps[[0, -1]]

@@ -22,18 +22,18 @@ from ms_slam_env.sequences.sequence import Frames, Sequence
 from ms_slam_env.sequences.trajectory import MAX_DIFFERENCE_S, associate
 
 SATURATED = 65535
-"""Largest value of a depth image with 16 bits, which many sensors write where they see nothing."""
+"""Largest value of a 16-bit depth image, which many sensors write for no reading."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One frame: when, in which files, and where the listing says so (``file:line``).
+    """One frame: its time, its files, and where it is listed (``file:line``).
 
     Attributes:
         timestamp: seconds.
         depth: path of the depth image.
-        color: path of the colour image; None where the recording has no colour.
-        where: for error messages.
+        color: path of the colour image; None if the recording has no colour.
+        where: origin for error messages.
     """
 
     timestamp: float
@@ -44,13 +44,13 @@ class Entry:
     def read(
         self, camera: Intrinsics, color_camera: Intrinsics | None = None
     ) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
-        """Colour (H, W, 3), if there is any, and values of depth (H, W), as they are on disk.
+        """Read colour (H, W, 3), if there is any, and depth values (H, W), as they are on disk.
 
-        Both are of the size that ``camera`` says, unless ``color_camera`` says that of colour.
+        Both have the size of ``camera``; if given, ``color_camera`` has that of colour.
 
         Raises:
-            InputError: a file that is missing, truncated, of another kind or size; the message
-                names it.
+            InputError: a file is missing, truncated, or of another kind or size; the message names
+                it.
         """
         depth = read_depth(self.depth, camera)
         color = None if self.color is None else read_color(self.color, color_camera or camera)
@@ -59,21 +59,20 @@ class Entry:
 
 @dataclass(frozen=True)
 class Recording(Frames):
-    """Frames in order of time; each is decoded when it is asked for.
+    """Recorded frames in order of time; each is decoded on request.
 
     Attributes:
-        name: for tables and files.
+        name: name for tables and files.
         layout: name of the folder layout it was read with.
         entries: N frames.
-        source: intrinsics of the images on disk, maybe of a camera with a lens, which frames have
-            no more.
-        intrinsics: intrinsics of the frames that are returned.
-        depth_scale: value of a depth image for one metre.
+        source: intrinsics of the images on disk, possibly distorted; returned frames are not.
+        intrinsics: intrinsics of the returned frames.
+        depth_scale: depth image value per metre.
         truth_times: (M,) seconds, or None.
         truth: (M, 4, 4) true T_world_camera, or None.
-        registration: where the colour camera is, if colour has to be brought into the depth
-            camera: known, or assumed to be a Kinect's; None where the recording has that done.
-        crop: the part of the images on disk that is taken; None for all of them.
+        registration: pose of the colour camera, known or assumed to be a Kinect's; None if colour
+            is already registered to depth.
+        crop: the part of the images on disk to use; None for whole images.
 
     Raises:
         InputError: no frame, or times that do not increase.
@@ -91,7 +90,7 @@ class Recording(Frames):
     crop: Crop | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be a sequence."""
+        """Refuse invalid frames and times."""
         if not self.entries:
             raise InputError(f"sequence {self.name} holds no frame")
         for before, entry in zip(self.entries, self.entries[1:], strict=False):
@@ -119,11 +118,11 @@ class Recording(Frames):
         """Return the same recording with its frames resampled to ``size``, such as ``320x240``.
 
         Args:
-            size: as `ms_slam_env.camera.image_size` describes; ``160x120+crop`` takes the largest
-                central part of that aspect.
+            size: see `ms_slam_env.camera.image_size`; ``160x120+crop`` takes the largest central
+                part with that aspect ratio.
 
         Raises:
-            InputError: an unknown size, or one that the images on disk cannot be reduced to.
+            InputError: an unknown size, or one to which the images on disk cannot be reduced.
         """
         named = parse_image_size(size)
         crop = named.part_of(self.source, f"sequence {self.name}")
@@ -132,19 +131,19 @@ class Recording(Frames):
         return dataclasses.replace(self, intrinsics=intrinsics, crop=crop)
 
     def every(self, n: int) -> Recording:
-        """Return the same recording with every ``n``-th frame, the first among them."""
+        """Return the same recording with every ``n``-th frame, starting with the first."""
         return dataclasses.replace(self, entries=self.entries[::n])
 
     def picked(self, indices: NDArray[np.integer]) -> Recording:
-        """Return the same recording with the frames of these numbers (M,) only, increasing."""
+        """Return the same recording with only the frames of these numbers (M,), increasing."""
         return dataclasses.replace(self, entries=tuple(self.entries[int(k)] for k in indices))
 
     def frame(self, index: int) -> RGBDFrame:
         """Decode frame ``index``: depth in metres, 0 = no reading; colour black if there is none.
 
         Raises:
-            InputError: a file that is missing, truncated, of another kind or size; the message
-                names it and the line that lists it.
+            InputError: a file is missing, truncated, or of another kind or size; the message names
+                it and the line that lists it.
         """
         entry = self.entries[index]
         known = self.registration if isinstance(self.registration, ColorCamera) else None
@@ -158,7 +157,7 @@ class Recording(Frames):
         color: NDArray[Any] = np.zeros((*raw.shape, 3), np.uint8) if read is None else read
         if known is not None and read is not None:
             color, is_seen = known.register(read, depth, self.source)
-            depth = np.where(is_seen, depth, np.float32(0))  # as an aligned image has it
+            depth = np.where(is_seen, depth, np.float32(0))  # as in a registered image
         if self.source.distortion:
             color = undistort_color(color, self.source)
             depth = undistort_depth(depth, self.source)
@@ -178,10 +177,10 @@ class Recording(Frames):
 
 @dataclass(frozen=True)
 class RecordedSequence(Sequence):
-    """A sequence whose frames are decoded from disk when they are asked for.
+    """A sequence whose frames are decoded from disk on request.
 
     Attributes:
-        frames: the recording, which has the true trajectory at its own times.
+        frames: the recording, which contains the true trajectory at its own times.
     """
 
     frames: Recording
@@ -198,7 +197,7 @@ class RecordedSequence(Sequence):
 
     @property
     def start(self) -> Float64 | None:
-        """The true pose (4, 4) nearest in time to the first frame, if it is near."""
+        """The true pose (4, 4) nearest in time to the first frame, if near enough."""
         trajectory = self.true_trajectory()
         if trajectory is None:
             return None
@@ -213,12 +212,12 @@ class RecordedSequence(Sequence):
         return None if times is None or poses is None else (times, poses)
 
     def picked(self, indices: NDArray[np.integer]) -> RecordedSequence:
-        """The same sequence with the frames of these numbers (M,) only, increasing."""
+        """Select the frames with these numbers (M,), increasing."""
         return recorded_sequence(self.frames.picked(indices))
 
 
 def recorded_sequence(recording: Recording) -> RecordedSequence:
-    """A recording with the true poses that were taken at the times of its frames."""
+    """Make a sequence from a recording, with the true poses at the times of its frames."""
     poses = np.full((len(recording), 4, 4), np.nan)
     if recording.truth is not None and recording.truth_times is not None:
         own, true = associate(recording.timestamps, recording.truth_times, MAX_DIFFERENCE_S)

@@ -1,9 +1,9 @@
-"""Depth of two cameras: rectified, then matched by OpenCV's semi-global block matching.
+"""Stereo depth: rectification, then OpenCV's semi-global block matching; KITTI odometry.
 
-Depth is thus an estimate of this package, not a reading of the recording: it has holes where there
-is no texture, at the left border and behind edges, and its error grows with the square of depth.
+The depth is thus an estimate by this package, not a recorded reading. It has holes without texture,
+at the left border and behind edges, and its error grows with depth squared.
 
-And KITTI odometry: rectified image pairs, ``calib.txt``, ``times.txt`` and ``poses.txt``.
+KITTI odometry: rectified image pairs, ``calib.txt``, ``times.txt`` and ``poses.txt``.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ from ms_slam_env.sequences.recording.listings import (
 from ms_slam_env.sequences.recording.recording import Entry, Recording
 
 _BLOCK_PX = 5
-_WIDEST = 1 / 6  # largest disparity over the width of the image, and so the nearest depth
+_WIDEST = 1 / 6  # largest disparity as a share of the image's width, which limits the nearest depth
 _NARROWEST_PX = 64
-_STEPS = 16.0  # of OpenCV's disparities, a pixel
+_STEPS = 16.0  # OpenCV's disparity steps per pixel
 
 
 class StereoRig:
-    """A left and a right camera, rectified to the left one's intrinsics without its lens.
+    """A left and a right camera, rectified to the left one's undistorted intrinsics.
 
     Attributes:
-        intrinsics: of the rectified images.
-        baseline_m: distance of the cameras.
+        intrinsics: intrinsics of the rectified images.
+        baseline_m: distance between the cameras.
         R_left_rectified: (3, 3) rotation of the rectified camera in the left one's frame.
     """
 
     def __init__(self, left: Intrinsics, right: Intrinsics, T_left_right: Float64) -> None:
-        """Rectify cameras of which ``T_left_right`` (4, 4) is the pose of the right one.
+        """Rectify cameras; ``T_left_right`` (4, 4) is the pose of the right one.
 
-        The rectified x runs along the baseline, z as near the two optical axes as that allows
-        (Hartley and Zisserman, section 11.12).
+        The rectified x axis follows the baseline, z is as close to the two optical axes as that
+        allows (Hartley and Zisserman, section 11.12).
 
         Raises:
-            InputError: images of different size or too narrow, or a right camera that is not to the
-                right or looks elsewhere.
+            InputError: the images differ in size or are too narrow, or the right camera is not to
+                the right or looks elsewhere.
         """
         if left.shape != right.shape:
             raise InputError(f"the two cameras have images of {left.shape} and {right.shape}")
@@ -84,9 +84,9 @@ class StereoRig:
         self._maps = [self._map(*one) for one in zip(self.cameras, rotations, strict=True)]
 
     def _map(self, camera: Intrinsics, R: Float64) -> NDArray[np.float32]:
-        """Column and row (2, H, W) in a camera's image of every pixel of the rectified one.
+        """Column and row (2, H, W) in a camera's image of every rectified pixel.
 
-        What is beyond 90 degrees of the camera's axis is beyond its image.
+        Directions beyond 90 degrees from the camera's axis are outside its image.
         """
         rays = self.intrinsics.rays() @ R.T
         ahead = rays[..., 2] > 1e-3
@@ -97,13 +97,13 @@ class StereoRig:
     def rectify(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8]
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Both images (H, W, 3) with corresponding points in the same row; black beyond them."""
+        """Rectify both images (H, W, 3): corresponding points share a row; black outside."""
         pairs = zip((left, right), self._maps, strict=True)
         one, other = (cv2.remap(image, x, y, cv2.INTER_LINEAR) for image, (x, y) in pairs)
         return one.astype(np.uint8, copy=False), other.astype(np.uint8, copy=False)
 
     def depth(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Depth (H, W) in metres of the rectified left image (H, W, 3); 0 where nothing matches."""
+        """Depth (H, W) in metres of the rectified left image (H, W, 3); 0 without a match."""
         matcher = _matcher(self.intrinsics.width)
         disparity = matcher.compute(intensity_image(left), intensity_image(right)) / _STEPS
         found = disparity > 0
@@ -130,11 +130,11 @@ def _matcher(width: int) -> cv2.StereoSGBM:
 
 @dataclass(frozen=True)
 class StereoEntry(Entry):
-    """A frame of two images; ``color`` and ``depth`` are both the left one.
+    """A stereo frame; ``color`` and ``depth`` are both the left image.
 
     Attributes:
         right: path of the right image.
-        rig: the cameras.
+        rig: the two cameras.
     """
 
     right: Path
@@ -143,7 +143,7 @@ class StereoEntry(Entry):
     def read(
         self, camera: Intrinsics, color_camera: Intrinsics | None = None
     ) -> tuple[NDArray[np.uint8] | None, NDArray[Any]]:
-        """The rectified left image, and depth in metres; see the base class."""
+        """Read the rectified left image, and depth in metres; see the base class."""
         paths = zip((self.depth, self.right), self.rig.cameras, strict=True)
         left, right = self.rig.rectify(*(read_grey(path, K) for path, K in paths))
         return left, self.rig.depth(left, right)
@@ -153,20 +153,20 @@ _PAIRS = ((2, 3), (0, 1))  # colour, grey
 
 
 def is_kitti(folder: Path) -> bool:
-    """Whether a folder is laid out so."""
+    """Whether a folder has KITTI's layout."""
     return is_named(folder / "calib.txt") and any(
         (folder / f"image_{left}").is_dir() for left, _ in _PAIRS
     )
 
 
 def open_kitti(folder: Path, intrinsics: Calibration | None) -> Recording:
-    """The left camera, of colour if there is any, with depth by stereo matching.
+    """Open the left camera, in colour if available, with depth by stereo matching.
 
-    Its true poses are those of ``poses.txt``, which are of camera 0, moved to it; also found as
-    ``../../poses/NN.txt``, where the dataset has them.
+    True poses come from ``poses.txt``, or the dataset's own ``../../poses/NN.txt``. They are those
+    of camera 0 and are transformed to this camera.
 
     Raises:
-        InputError: intrinsics given; a file that is missing or does not parse.
+        InputError: intrinsics were given; a file is missing or invalid.
     """
     if intrinsics is not None:
         raise InputError(f"{folder}: the calibration of KITTI is that of its calib.txt")
@@ -202,7 +202,7 @@ def open_kitti(folder: Path, intrinsics: Calibration | None) -> Recording:
 
 
 def _projection(path: Path, name: str) -> Float64:
-    """The matrix (3, 4) of a line ``P0: ...``."""
+    """Read the matrix (3, 4) of a line ``P0: ...``."""
     for where, words in rows(path):
         if words[0].rstrip(":") == name:
             return _matrix(words[1:], where)
@@ -223,12 +223,12 @@ def _place(P: Float64) -> Float64:
 
 
 def _intrinsics(P: Float64, image: Path) -> Intrinsics:
-    """Of the size of an image: ``calib.txt`` does not say it."""
+    """Intrinsics with an image's size, which is not in ``calib.txt``."""
     return Intrinsics(P[0, 0], P[1, 1], P[0, 2], P[1, 2], *image_size(image))
 
 
 def _truth(folder: Path, count: int) -> Float64 | None:
-    """T_world_camera0 (N, 4, 4), if there is one a frame."""
+    """T_world_camera0 (N, 4, 4), if there is one per frame."""
     for path in (folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"):
         if is_named(path):
             return read_poses(path, count)

@@ -1,11 +1,13 @@
-"""Run-time adaptation: a running SLAM among configurations (Saeedi et al., ICRA 2017, section V-B).
+"""Run-time adaptation: switching configurations of a running SLAM.
+
+Saeedi et al., ICRA 2017, section V-B.
 
 ::
 
     config = make_config("divergence", configurations=["fast.yaml", "robust.yaml"])
     backend = config.adapt(slam.make("surfel", intrinsics))   # a SlamBackend again
     backend.track(frame)
-    backend.level                                             # index of the one in force
+    backend.level                                             # index of the active configuration
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from ms_slam_env.slam.adaptation.controllers import (
 
 
 def make_config(name: str, **options: Any) -> AdaptationConfig:
-    """The configuration ``name`` with its options, nested ones as mappings.
+    """Make the configuration ``name`` with its options, nested ones as mappings.
 
     Raises:
         InputError: an unknown name or option (the message lists the valid ones), or a bad value.

@@ -1,4 +1,4 @@
-"""A surfel SLAM that changes its configuration while its map lives on."""
+"""A surfel SLAM that changes its configuration and keeps its map."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from ms_slam_env.slam.shared.state_check import Depending, WholeNumber
 from ms_slam_env.slam.slam_backend import SlamBackend
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
-_NEVER = 1_000_000_000  # frames in a row that are dropped at most
+_NEVER = 1_000_000_000  # limit on consecutive dropped frames, so none
 
 
 class Controller(Stateful):
-    """Chooses before every frame one of the configurations, by index from fast to robust.
+    """Chooses a configuration before every frame, by index from fast to robust.
 
     Attributes:
-        index: of the configuration chosen last; of the first one before any frame.
+        index: index of the configuration chosen last; before any frame, of the first one.
     """
 
     index: int
@@ -36,7 +36,7 @@ class Controller(Stateful):
 
     @abstractmethod
     def choose(self, frame: RGBDFrame, is_lost: bool) -> int:
-        """Index of the configuration under which ``frame`` is to be processed.
+        """Index of the configuration to process ``frame`` with.
 
         Args:
             frame: the sensor's frame.
@@ -44,16 +44,16 @@ class Controller(Stateful):
         """
 
     def use(self, index: int) -> None:
-        """Take configuration ``index`` from the next frame on.
+        """Use configuration ``index`` from the next frame on.
 
         Raises:
-            InputError: this variant chooses by itself.
+            InputError: this controller chooses by itself.
         """
         raise InputError("configurations are chosen from outside under adaptation 'agent' only")
 
 
 MOST = 8
-"""Configurations that may take turns: a running SLAM keeps the buffers of so many."""
+"""Most configurations to switch between: a running SLAM keeps the buffers of all."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Level:
     Attributes:
         config: its parameters.
         image_size: (width, height) that frames are reduced to; None: as they come.
-        keep_every: of the frames, one in so many is processed.
+        keep_every: every n-th frame is processed.
     """
 
     config: SurfelConfig
@@ -72,10 +72,10 @@ class Level:
 
 
 def as_configurations(given: Iterable[Any]) -> tuple[SlamConfiguration, ...]:
-    """Configurations given as file, as mapping of ``SlamConfiguration``'s fields, or as such.
+    """Convert files, mappings of ``SlamConfiguration``'s fields, or such objects to configurations.
 
     Raises:
-        InputError: something else, a bad file or value, none at all or more than ``MOST``.
+        InputError: another type, a bad file or value, none at all or more than ``MOST``.
     """
     if isinstance(given, (str, Mapping)) or not isinstance(given, Iterable):
         raise InputError(f"configurations = {given!r} must be a list of files or mappings")
@@ -98,15 +98,14 @@ def _configuration(given: Any, index: int) -> SlamConfiguration:
 def make_levels(
     configurations: Sequence[SlamConfiguration], backend: SlamBackend
 ) -> tuple[Level, ...]:
-    """Levels for a backend; what a configuration does not name stays as the backend was made.
+    """Make a backend's levels; options that a configuration omits keep the backend's values.
 
-    ``threads`` is no matter of a running SLAM and left alone. The backend goes through all of them
-    and is as before at the end, so that what it cannot become is refused here, and its buffers are
-    there when they are needed.
+    ``threads`` is ignored, as it cannot change while SLAM runs. The backend tries all levels and is
+    then restored, so unsupported ones are refused here, and all buffers are allocated in advance.
 
     Raises:
-        InputError: the backend is none whose configuration can change, or a configuration that it
-            cannot take up while it runs.
+        InputError: the backend cannot change its configuration, or not to one of these while it
+            runs.
     """
     if not isinstance(backend, SurfelSlam):
         raise InputError("only the SLAM backend 'surfel' changes its configuration while it runs")
@@ -138,11 +137,10 @@ def make_levels(
 def default_configurations(intrinsics: Intrinsics) -> tuple[SlamConfiguration, ...]:
     """Three configurations for a camera's images, from fast to robust.
 
-    Images are halved where the camera's are large enough: that is faster and, because every level
-    of the pyramid is coarser, copes with larger motions. Chosen on validation seeds
-    (``ms-slam experiment adaptation``). ``about.cost`` is the processor time of
-    a processed frame at 160x120, relative to the last: 6.1, 6.9 and 9.5 ms were measured on one
-    core of a busy machine.
+    Images are halved if they are large enough. That is faster and, because every pyramid level is
+    coarser, copes with larger motions. Chosen on validation seeds (``ms-slam experiment
+    adaptation``). ``about.cost`` is the processor time of a processed frame at 160x120, relative to
+    the last configuration: 6.1, 6.9 and 9.5 ms were measured on one core of a busy machine.
     """
     half = intrinsics.width // 2
     size = next((name for name, wh in XTION_SIZES.items() if wh[0] == half >= 160), None)
@@ -159,14 +157,14 @@ class AdaptiveSlam(SelectiveSlam):
     """A backend whose controller chooses its configuration before every frame.
 
     A configuration that keeps one frame in n drops the others: their results have ``processed``
-    False and a pose carried on at constant velocity (``SelectiveSlam``). The first frame and those
+    False and a pose predicted at constant velocity (``SelectiveSlam``). The first frame and those
     while tracking is lost are always processed.
 
     Args:
-        backend: a ``SurfelSlam``; whoever holds it as well must not feed it frames.
+        backend: a ``SurfelSlam``; nothing else may feed it frames.
         levels: its configurations from fast to robust (``make_levels``).
         controller: chooses among them.
-        drops_frames: whether ``keep_every`` counts; where not, every frame is processed.
+        drops_frames: whether ``keep_every`` applies; if not, every frame is processed.
     """
 
     def __init__(
@@ -181,13 +179,13 @@ class AdaptiveSlam(SelectiveSlam):
         self._switch = _Switch(backend, levels, controller, drops_frames)
         super().__init__(backend, self._switch, max_skip=_NEVER)
 
-    # The level is put in force before the backend takes arrays of its image size.
+    # The level is activated before the backend restores arrays of its image size.
     saved: ClassVar[tuple[str, ...]] = tuple(
         sorted(SelectiveSlam.saved, key=lambda name: name != "_filter")
     )
 
     def state_like(self) -> Any:
-        """See ``Stateful``: arrays have the image size of the level in force."""
+        """See ``Stateful``; arrays have the image size of the active level."""
         likes: list[Any] = []
         for index in reversed(range(len(self.levels))):
             self._switch.put_in_force(index)
@@ -202,7 +200,7 @@ class AdaptiveSlam(SelectiveSlam):
 
     @property
     def level(self) -> int:
-        """Index of the configuration of the last processed frame; of the first before any."""
+        """Index of the last processed frame's configuration; before any frame, of the first one."""
         return self._switch.index
 
     @property
@@ -211,22 +209,22 @@ class AdaptiveSlam(SelectiveSlam):
         return self._switch.levels
 
     def use(self, index: int) -> None:
-        """Take configuration ``index`` from the next frame on.
+        """Use configuration ``index`` from the next frame on.
 
         Raises:
-            InputError: no such index, or a variant that chooses by itself.
+            InputError: no such index, or the controller chooses by itself.
         """
         self.controller.use(index)
 
 
 def _has_index(state: Any) -> bool:
-    """Whether a state says which level was in force; if not, other checks say what is wrong."""
+    """Whether a state contains the active level; if not, other checks report it."""
     chosen = state.get("filter") if isinstance(state, Mapping) else None
     return isinstance(chosen, Mapping) and isinstance(chosen.get("index"), int)
 
 
 class _Switch(FrameFilter):
-    """Puts the chosen level in force, and admits the frames that it keeps."""
+    """Activates the chosen level, and admits the frames that it keeps."""
 
     def __init__(
         self,
@@ -247,18 +245,18 @@ class _Switch(FrameFilter):
         self.put_in_force(self._controller.index)
 
     def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
-        """Whether the level in force keeps this frame; ``forced`` means lost or not started."""
+        """Whether the active level keeps this frame; ``forced`` means lost or not started."""
         self.put_in_force(self._controller.choose(frame, forced))
         return not self._drops_frames or dropped + 1 >= self.levels[self.index].keep_every
 
     def put_in_force(self, index: int) -> None:
-        """Track with the configuration of a level from now on."""
+        """Track with this level's configuration from now on."""
         self.index = index
         level = self.levels[index]
         self._backend.reconfigure(level.config, level.image_size)
 
     def get_state(self) -> dict[str, Any]:
-        """The level in force and the controller's."""
+        """The active level and the controller's state."""
         return {"index": self.index, "controller": self._controller.get_state()}
 
     def state_like(self) -> Any:
@@ -267,6 +265,6 @@ class _Switch(FrameFilter):
         return {"index": index, "controller": self._controller.state_like()}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state."""
+        """Restore a state."""
         self.put_in_force(state["index"])
         self._controller.set_state(state["controller"])

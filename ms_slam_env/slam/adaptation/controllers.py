@@ -1,7 +1,7 @@
-"""What chooses a configuration: the observed divergence (section V-B of the paper), or an agent.
+"""Controllers that choose a configuration, by observed divergence or as an agent says.
 
-A set of parameters is good up to a maximum information divergence; where more is observed, another
-set is taken up, which costs more and copes with it.
+Section V-B of the paper: a set of parameters works up to a maximum information divergence. Above
+it, a more expensive set takes over that copes with more.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from ms_slam_env.slam.slam_backend import SlamBackend
 
 
 def rising(values: Any, name: str, count: int) -> tuple[float, ...]:
-    """``count`` positive numbers, each larger than the one before, as a tuple.
+    """Return ``values`` as a tuple of ``count`` positive, strictly increasing numbers.
 
     Raises:
-        InputError: they are something else.
+        InputError: they are anything else.
     """
     is_list = isinstance(values, (tuple, list))
     numbers = [x for x in values if isinstance(x, (int, float))] if is_list else []
@@ -50,43 +50,44 @@ def rising(values: Any, name: str, count: int) -> tuple[float, ...]:
 class AdaptationConfig(Checked, Family, ABC):
     """How a running SLAM changes its configuration: Saeedi et al., ICRA 2017, section V-B.
 
-    Made from a mapping: ``from_dict(AdaptationConfig, {"name": "divergence", ...})``.
+    Make one from a mapping: ``from_dict(AdaptationConfig, {"name": "divergence", ...})``.
     """
 
     @abstractmethod
     def adapt(self, backend: SlamBackend, drops_frames: bool = True) -> SlamBackend:
-        """``backend`` with this adaptation; ``keep_every`` counts only if it ``drops_frames``.
+        """Add this adaptation to ``backend``; ``keep_every`` applies only if ``drops_frames``.
 
         Raises:
-            InputError: a backend or a configuration that cannot change while SLAM runs.
+            InputError: the backend cannot change its configuration, or not to one of these, while
+                SLAM runs.
         """
 
 
 @dataclass(frozen=True)
 class NoAdaptationConfig(AdaptationConfig):
-    """The configuration stays as it is."""
+    """No adaptation: the configuration never changes."""
 
     name: str = field(default="none", init=False)
 
     def adapt(self, backend: SlamBackend, drops_frames: bool = True) -> SlamBackend:
-        """The backend as it is."""
+        """Return the backend unchanged."""
         return backend
 
 
 @dataclass(frozen=True)
 class SwitchingConfig(AdaptationConfig):
-    """Of what switches among configurations.
+    """Base of adaptations that switch between configurations.
 
     Attributes:
-        configurations: from fast to robust, at least two: YAML files of ``SlamConfiguration``,
-            mappings of its fields, or such objects. What one does not name stays as the backend
-            was made. None: three that suit the camera (``default_configurations``).
-        start: index of the first in force; None: the last, the most robust.
-        costs: of each configuration, rising and positive: a stand-in for processor time that is
-            the same in every run. None: ``about.cost`` of each configuration.
+        configurations: at least two, from fast to robust: YAML files of ``SlamConfiguration``,
+            mappings of its fields, or such objects. Omitted options keep the backend's values.
+            None: three that suit the camera (``default_configurations``).
+        start: index of the configuration to start with; None: the last, the most robust.
+        costs: positive, increasing cost of each configuration: a deterministic substitute for
+            processor time. None: ``about.cost`` of each configuration.
 
     Raises:
-        InputError: a bad configuration, an index that none has, or bad costs.
+        InputError: a bad configuration, an index out of range, or bad costs.
     """
 
     configurations: Any = None
@@ -107,12 +108,12 @@ class SwitchingConfig(AdaptationConfig):
 
     @property
     def num_configurations(self) -> int:
-        """K, how many take turns."""
+        """Number K of configurations."""
         return 3 if self.configurations is None else len(self.configurations)
 
     @property
     def first(self) -> int:
-        """Index of the first configuration in force."""
+        """Index of the configuration to start with."""
         return self.num_configurations - 1 if self.start is None else self.start
 
     def resolved(self, intrinsics: Intrinsics) -> tuple[SlamConfiguration, ...]:
@@ -122,10 +123,10 @@ class SwitchingConfig(AdaptationConfig):
         return tuple(self.configurations)
 
     def costs_of(self, intrinsics: Intrinsics) -> tuple[float, ...]:
-        """(K,) the cost of each configuration for frames of ``intrinsics``.
+        """Cost (K,) of each configuration for frames of ``intrinsics``.
 
         Raises:
-            InputError: neither ``costs`` nor the configurations say it.
+            InputError: neither ``costs`` nor the configurations specify it.
         """
         if self.costs is not None:
             return self.costs
@@ -138,31 +139,32 @@ class SwitchingConfig(AdaptationConfig):
 
     @abstractmethod
     def make_controller(self, intrinsics: Intrinsics) -> Controller:
-        """What chooses among them."""
+        """Make the controller that chooses a configuration."""
 
     def adapt(self, backend: SlamBackend, drops_frames: bool = True) -> SlamBackend:
-        """``backend`` that switches; see ``AdaptiveSlam``."""
+        """Make ``backend`` switch between configurations; see ``AdaptiveSlam``."""
         levels = make_levels(self.resolved(backend.intrinsics), backend)
         return AdaptiveSlam(backend, levels, self.make_controller(backend.intrinsics), drops_frames)
 
 
 @dataclass(frozen=True)
 class DivergenceAdaptationConfig(SwitchingConfig):
-    """More divergence between frames, more robust a configuration; with hysteresis.
+    """Chooses a more robust configuration for more divergence between frames, with hysteresis.
 
     Attributes:
-        thresholds: K - 1 rising values; where the change between consecutive frames exceeds the
-            i-th, configuration i is not good enough. Up at once, as far as needed.
-        release_share: of the thresholds, below which the way down is open, (0, 1].
-        dwell_frames: down only as far as the largest change of so many frames permits.
-        levels: file that an exploration wrote, whose configurations, thresholds and costs are
-            taken in place of these; None from then on.
-        per: the change per ``frame`` or, by the time stamps, per ``second``.
+        thresholds: K - 1 increasing values. If the change between consecutive frames exceeds the
+            i-th, configuration i is not good enough; it switches up at once, as far as needed.
+        release_share: share of a threshold, in (0, 1], that the change must fall below to switch
+            down.
+        dwell_frames: number of recent frames whose largest change limits how far it switches down.
+        levels: file written by a design-space exploration, whose configurations, thresholds and
+            costs replace these; reset to None once read.
+        per: measure the change per ``frame`` or, by the time stamps, per ``second``.
         change: how the change between frames is measured.
 
     Raises:
-        InputError: another number of thresholds than of configurations less one, thresholds that
-            do not rise, or a value out of range.
+        InputError: the number of thresholds is not that of configurations minus one, they do not
+            increase, or a value is out of range.
     """
 
     name: str = field(default="divergence", init=False)
@@ -181,7 +183,7 @@ class DivergenceAdaptationConfig(SwitchingConfig):
         object.__setattr__(self, "thresholds", rising(self.thresholds, "thresholds", wanted))
 
     def _take(self, levels: str | Path) -> None:
-        """Take configurations, thresholds and costs from a file."""
+        """Read configurations, thresholds and costs from a file."""
         if self.configurations is not None:
             raise InputError("levels and configurations both say what to switch among; give one")
         found = read_levels(levels, "adaptation")
@@ -190,15 +192,16 @@ class DivergenceAdaptationConfig(SwitchingConfig):
         object.__setattr__(self, "levels", None)
 
     def make_controller(self, intrinsics: Intrinsics) -> Controller:
-        """The controller for frames of ``intrinsics``."""
+        """Make the controller for frames of ``intrinsics``."""
         return DivergenceController(self, intrinsics)
 
 
 class DivergenceController(Saved, Controller):
-    """Up at once, down after a while below.
+    """Switches up at once, and down after a number of frames below the threshold.
 
     Attributes:
-        change: between the last two frames, nats or nats per second; 0 before the second frame.
+        change: change between the last two frames, nats or nats per second; 0 before the second
+            frame.
     """
 
     saved = ("_measure", "change", "_time_s", "index", "_recent")
@@ -215,7 +218,7 @@ class DivergenceController(Saved, Controller):
         self.change = 0.0
         self._time_s: float | None = None  # of the last frame
         self.index = self._config.first
-        self._recent: list[float] = []  # changes of the last frames, as many as the dwell
+        self._recent: list[float] = []  # changes of the last ``dwell_frames`` frames
 
     def state_like(self) -> Any:
         """See ``Stateful``."""
@@ -226,7 +229,7 @@ class DivergenceController(Saved, Controller):
         }
 
     def choose(self, frame: RGBDFrame, is_lost: bool) -> int:
-        """Index by the change from the frame before."""
+        """Choose by the change from the frame before."""
         is_first = self._time_s is None
         self._observe(frame)
         if is_first:
@@ -240,7 +243,7 @@ class DivergenceController(Saved, Controller):
         return self.index
 
     def _observe(self, frame: RGBDFrame) -> None:
-        """Measure the change from the frame before; it is the reference from now on."""
+        """Measure the change from the frame before; this frame is the next reference."""
         nats = self._measure.measure(frame)
         self._measure.keep()
         before, self._time_s = self._time_s, frame.timestamp
@@ -258,17 +261,17 @@ class DivergenceController(Saved, Controller):
 
 @dataclass(frozen=True)
 class AgentConfig(SwitchingConfig):
-    """``AdaptiveSlam.use(index)`` says which configuration is in force."""
+    """The agent chooses the configuration with ``AdaptiveSlam.use(index)``."""
 
     name: str = field(default="agent", init=False)
 
     def make_controller(self, intrinsics: Intrinsics) -> Controller:
-        """The controller that is told."""
+        """Make a controller that obeys ``use``."""
         return AgentController(self.num_configurations, self.first)
 
 
 class AgentController(Saved, Controller):
-    """Keeps to what it was told last."""
+    """Keeps the configuration set last by ``use``."""
 
     saved = ("index",)
 
@@ -277,7 +280,7 @@ class AgentController(Saved, Controller):
         self.reset()
 
     def reset(self) -> None:
-        """Back to the first."""
+        """Return to the first configuration."""
         self.index = self._first
 
     def state_like(self) -> Any:
@@ -285,11 +288,11 @@ class AgentController(Saved, Controller):
         return {"index": WholeNumber(most=self._count - 1)}
 
     def choose(self, frame: RGBDFrame, is_lost: bool) -> int:
-        """The index told."""
+        """Return the index set last."""
         return self.index
 
     def use(self, index: int) -> None:
-        """Take configuration ``index`` from the next frame on."""
+        """Use configuration ``index`` from the next frame on."""
         if not 0 <= index < self._count:
             raise InputError(f"configuration {index!r} is outside [0, {self._count - 1}]")
         self.index = int(index)

@@ -1,4 +1,4 @@
-"""Which frames SLAM processes: active frame management (Saeedi et al., ICRA 2017, section V-A).
+"""Frame selection: which frames SLAM processes (Saeedi et al., ICRA 2017, section V-A).
 
 ::
 
@@ -24,7 +24,7 @@ from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter, Selecti
 
 
 def make_config(name: str, **options: Any) -> FrameSelectionConfig:
-    """The configuration ``name`` with its options, nested ones as mappings.
+    """Make the configuration ``name`` with its options, nested ones as mappings.
 
     Raises:
         InputError: an unknown name or option (the message lists the valid ones), or a bad value.
@@ -34,7 +34,7 @@ def make_config(name: str, **options: Any) -> FrameSelectionConfig:
 
 
 def parse_frame_selection(text: str) -> FrameSelectionConfig:
-    """The configuration ``NAME,option=value,...``; nested options as in ``change.width=40``.
+    """Parse ``NAME,option=value,...``; nested options as in ``change.width=40``.
 
     Raises:
         InputError: an unknown name or option (the message lists the valid ones), or a bad value.

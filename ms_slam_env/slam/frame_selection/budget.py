@@ -1,4 +1,4 @@
-"""A threshold of divergence that is steered so that a budget is kept: section V-A of the paper."""
+"""Controls the divergence threshold to keep a budget: section V-A of the paper."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from ms_slam_env.slam.frame_selection.selective_slam import FrameFilter
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import OrNone
 
-LOWEST_THRESHOLD = 1e-4  # a frame that changes less is dropped though it could be afforded
-HIGHEST_THRESHOLD = 10.0  # a frame that changes more is processed though it cannot be afforded
+LOWEST_THRESHOLD = 1e-4  # a frame that changes less is dropped even if affordable
+HIGHEST_THRESHOLD = 10.0  # a frame that changes more is processed even if not affordable
 
 
 class ThresholdController(Saved):
-    """Raises a threshold with what was spent and lowers it with what was allowed.
+    """Raises a threshold with spending and lowers it with the allowance.
 
-    The threshold is ``start exp(gain debt)``, the debt being what was spent beyond what was
-    allowed so far: integral control of the logarithm, for changes between frames range over orders
-    of magnitude. As the threshold stays between two limits so does the debt, by at most
-    ln(highest / lowest) / gain, so that the mean of what is spent tends to what is allowed whatever
-    the changes are, provided that they lie between the limits.
+    The threshold is ``start exp(gain debt)``, where the debt is total spending minus total
+    allowance. It is integral control of the logarithm, because changes between frames range over
+    orders of magnitude. The threshold stays between two limits, so the debt varies by at most
+    ln(highest / lowest) / gain. Mean spending therefore tends to the allowance, provided that the
+    changes lie between the limits.
 
     Args:
         start: the threshold without debt.
-        gain: per processed frame of debt.
-        lowest: the threshold never falls below it; what is left over then is lost.
-        highest: the threshold never rises above it.
+        gain: change of the threshold's logarithm per processed frame of debt.
+        lowest: lower limit of the threshold; allowance unused there is lost.
+        highest: upper limit of the threshold.
     """
 
     saved = ("debt",)
@@ -44,43 +44,43 @@ class ThresholdController(Saved):
         self.debt = 0.0
 
     def reset(self) -> None:
-        """Owe nothing."""
+        """Clear the debt."""
         self.debt = 0.0
 
     @property
     def threshold(self) -> float:
-        """What a change must reach now."""
+        """The threshold that a change must reach now."""
         return self._start * math.exp(self._gain * self.debt)
 
     def update(self, spent: float, allowed: float) -> None:
-        """Book what a frame cost and what it was allowed to, in processed frames."""
+        """Account for a frame's cost and allowance, in units of processed frames."""
         self.debt = min(max(self.debt + spent - allowed, self._least), self._most)
 
 
 @dataclass(frozen=True)
 class BudgetConfig(DroppingConfig):
-    """Frames are dropped below a threshold of divergence that keeps a budget.
+    """Drops frames below a divergence threshold that is controlled to keep a budget.
 
     "The threshold can be dynamic and could be a function of the available resources such as battery
-    or the processing resources" (Saeedi et al., ICRA 2017, section V-A). Quiet stretches save up
-    for violent ones.
+    or the processing resources" (Saeedi et al., ICRA 2017, section V-A). Periods of little change
+    save for periods of much change.
 
     Attributes:
-        share: of the frames that may be processed, where there is no ``budget_per_s``.
-        budget_per_s: what may be spent in a second of the frames' time stamps, in the unit of the
-            costs: joules, processor seconds, frames.
-        cost_per_frame: of processing a frame.
-        cost_per_look: of judging a frame, processed or not.
-        measured: costs are processor seconds as measured instead; no two runs need then be alike.
-        gain: how fast the threshold follows: it changes by this share for each processed frame
-            too many or too few. Slower lets quiet stretches pay for violent ones, faster keeps the
-            budget over shorter times.
-        threshold: to begin with, nats.
-        change: how it is measured.
+        share: share of the frames that may be processed; used without ``budget_per_s``.
+        budget_per_s: budget per second of the frames' time stamps, in the unit of the costs:
+            joules, processor seconds or frames.
+        cost_per_frame: cost of processing a frame.
+        cost_per_look: cost of judging a frame, whether processed or not.
+        measured: use measured processor seconds as costs; runs are then not reproducible.
+        gain: how fast the threshold adapts: its relative change per processed frame too many or too
+            few. A lower gain averages over more change; a higher one keeps the budget over shorter
+            times.
+        threshold: initial threshold, nats.
+        change: how the change is measured.
 
     Raises:
         InputError: a value out of range, a share that ``max_skip`` does not permit, or a cost
-            where only a share is given.
+            although only a share is given.
     """
 
     name: str = field(default="budget", init=False)
@@ -114,12 +114,12 @@ class BudgetConfig(DroppingConfig):
         return self.measured
 
     def make_filter(self, intrinsics: Intrinsics) -> FrameFilter:
-        """The filter for frames of ``intrinsics``."""
+        """Make the filter for frames of ``intrinsics``."""
         return BudgetFilter(self, Change(self.change, intrinsics))
 
 
 class BudgetFilter(Saved, FrameFilter):
-    """Admits a frame that differs enough from the last processed one for what can be afforded."""
+    """Admits a frame that differs enough from the last processed one, given the budget."""
 
     saved = ("_change", "_controller", "_time", "_processed", "_allowed", "_spent_s", "_count")
 
@@ -137,20 +137,20 @@ class BudgetFilter(Saved, FrameFilter):
 
     @property
     def threshold(self) -> float:
-        """What the change of the next frame must reach, nats."""
+        """Threshold for the next frame's change, nats."""
         return self._controller.threshold
 
     def reset(self) -> None:
-        """Forget every frame, owe nothing."""
+        """Forget every frame, and clear the debt."""
         self._change.reset()
         self._controller.reset()
         self._time: float | None = None
-        self._processed = False  # the last frame
+        self._processed = False  # whether the last frame was
         self._allowed = 0.0  # for the last frame
-        self._spent_s, self._count = 0.0, 0  # on processed frames, as measured
+        self._spent_s, self._count = 0.0, 0  # measured on processed frames
 
     def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
-        """Whether its change reaches the threshold of now."""
+        """Whether its change reaches the current threshold."""
         config = self._config
         self._allowed = self._allowance(frame.timestamp)
         admitted = self._change.measure(frame) >= self.threshold
@@ -163,7 +163,7 @@ class BudgetFilter(Saved, FrameFilter):
         return admitted
 
     def charge(self, seconds: float) -> None:
-        """Book the processor time of the last frame where costs are measured."""
+        """Account for the last frame's processor time if costs are measured."""
         if not self._config.measured:
             return
         if self._processed:
@@ -173,7 +173,7 @@ class BudgetFilter(Saved, FrameFilter):
             self._book(seconds, self._spent_s / self._count)
 
     def _allowance(self, timestamp: float) -> float:
-        """What may be spent since the last frame, in the unit of the costs."""
+        """Allowance since the last frame, in the unit of the costs."""
         config = self._config
         if config.budget_per_s is None:
             return config.share * config.cost_per_frame
@@ -188,5 +188,5 @@ class BudgetFilter(Saved, FrameFilter):
         return config.budget_per_s * (timestamp - before)
 
     def _book(self, spent: float, unit: float) -> None:
-        """Book costs, ``unit`` being that of a processed frame."""
+        """Account for costs; ``unit`` is the cost of a processed frame."""
         self._controller.update(spent / unit, self._allowed / unit)

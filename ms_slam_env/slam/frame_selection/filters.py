@@ -1,6 +1,6 @@
-"""Which frames are processed: all, every n-th, or those unlike the last processed one.
+"""Filters that select frames: all, every n-th, or those unlike the last processed one.
 
-Every n-th frame is the frame drop rate of the paper's section IV, the last its section V-A.
+Every n-th frame is the frame drop rate of the paper's section IV; the last is its section V-A.
 """
 
 from __future__ import annotations
@@ -28,48 +28,48 @@ _ROUNDING = 1e-9  # 13 / 1.3 is less than 10
 
 @dataclass(frozen=True)
 class FrameSelectionConfig(Family, ABC):
-    """Which frames SLAM processes; from ``from_dict(FrameSelectionConfig, {"name": ...})``."""
+    """Which frames SLAM processes; made by ``from_dict(FrameSelectionConfig, {"name": ...})``."""
 
     name: str = field(default="", init=False)
 
     @abstractmethod
     def make_filter(self, intrinsics: Intrinsics) -> FrameFilter:
-        """The filter for frames of ``intrinsics``."""
+        """Make the filter for frames of ``intrinsics``."""
 
     def manage(self, backend: SlamBackend) -> SlamBackend:
-        """``backend`` with this filter in front of it."""
+        """Put this filter in front of ``backend``."""
         return SelectiveSlam(backend, self.make_filter(backend.intrinsics))
 
     @property
     def uses_clock(self) -> bool:
-        """Whether decisions depend on measured time, so that no two runs need be alike."""
+        """Whether decisions depend on measured time, so that runs are not reproducible."""
         return False
 
 
 @dataclass(frozen=True)
 class EveryFrameConfig(FrameSelectionConfig):
-    """Every frame is processed."""
+    """Processes every frame."""
 
     name: str = field(default="none", init=False)
 
     def make_filter(self, intrinsics: Intrinsics) -> FrameFilter:
-        """The filter that admits everything."""
+        """Make the filter that admits everything."""
         return RegularSkipping(1)
 
     def manage(self, backend: SlamBackend) -> SlamBackend:
-        """The backend as it is."""
+        """Return the backend unchanged."""
         return backend
 
 
 @dataclass(frozen=True)
 class DroppingConfig(Checked, FrameSelectionConfig):
-    """Of a filter that drops frames.
+    """Base of filters that drop frames.
 
     Attributes:
-        max_skip: most frames dropped in a row; it protects tracking.
-        pose: of a dropped frame: ``constant-velocity``, the last pose moved on as between the
-            last two processed frames, at most as far, or ``last``, the last processed frame's. A
-            pose that the caller knows or guesses takes precedence.
+        max_skip: most frames dropped in a row, to protect tracking.
+        pose: pose of a dropped frame: ``constant-velocity``, the last pose extrapolated by at most
+            the motion between the last two processed frames, or ``last``, the last processed
+            frame's pose. A pose that the caller knows or guesses takes precedence.
     """
 
     _: KW_ONLY
@@ -77,20 +77,20 @@ class DroppingConfig(Checked, FrameSelectionConfig):
     pose: str = chosen("constant-velocity", *PREDICTIONS)
 
     def manage(self, backend: SlamBackend) -> SlamBackend:
-        """``backend`` with this filter in front of it."""
+        """Put this filter in front of ``backend``."""
         made = self.make_filter(backend.intrinsics)
         return SelectiveSlam(backend, made, self.max_skip, self.pose)
 
 
 @dataclass(frozen=True)
 class RegularConfig(DroppingConfig):
-    """Every n-th frame is processed.
+    """Processes every n-th frame.
 
     Attributes:
-        every: n; 2.5 takes turns between every second and every third.
+        every: n; 2.5 alternates between every second and every third.
 
     Raises:
-        InputError: a value out of range, or more frames to drop in a row than ``max_skip``.
+        InputError: a value out of range, or more consecutive drops than ``max_skip``.
     """
 
     name: str = field(default="regular", init=False)
@@ -106,7 +106,7 @@ class RegularConfig(DroppingConfig):
             )
 
     def make_filter(self, intrinsics: Intrinsics) -> FrameFilter:
-        """The filter."""
+        """Make the filter."""
         return RegularSkipping(self.every)
 
 
@@ -135,15 +135,15 @@ class RegularSkipping(Saved, FrameFilter):
 class ChangeConfig(Checked):
     """How the change between two frames is measured.
 
-    The change is delta_I + depth_weight delta_D, nats, of equations (5) and (10): the sum that the
-    paper's Algorithm 1 forms with its lambda.
+    The change is delta_I + depth_weight delta_D in nats, from equations (5) and (10): the sum in
+    the paper's Algorithm 1, with lambda as weight.
 
     Attributes:
-        width: pixels are left out so that about so many columns remain; a frame must be cheap to
-            judge.
+        width: approximate number of columns that pixels are subsampled to, to keep judging a frame
+            cheap.
         depth_weight: lambda. On hand-held sequences of validation seeds the sum with 1 followed the
             size of the motion at least as well as either divergence alone.
-        divergence: of the two kinds.
+        divergence: parameters of the two divergences.
     """
 
     width: int = bounded(80, 8, 10_000)
@@ -180,7 +180,7 @@ class Change(Stateful):
         return float(self._measure.divergence(self._current, self._reference)[0] @ self._weights)
 
     def keep(self) -> None:
-        """Make the frame that was measured last the reference."""
+        """Make the last measured frame the reference."""
         self._reference = self._current
 
     def get_state(self) -> dict[str, Any]:
@@ -200,7 +200,7 @@ class Change(Stateful):
         return Fields(like, _why_no_reference)
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on with the reference of a state."""
+        """Restore the reference from a state."""
         self._current = None
         if state["intensity"] is None:
             self._reference = None
@@ -209,23 +209,24 @@ class Change(Stateful):
 
 
 def _why_no_reference(state: dict[str, Any]) -> str:
-    """What is wrong between the two histograms of a state."""
+    """What is inconsistent between a state's two histograms."""
     is_whole = (state["intensity"] is None) == (state["normals"] is None)
     return "" if is_whole else "has one of the two histograms"
 
 
 @dataclass(frozen=True)
 class DivergenceFilterConfig(DroppingConfig):
-    """A frame is dropped if its divergence from a reference frame is below a threshold.
+    """Drops a frame if its divergence from a reference frame is below a threshold.
 
     Attributes:
-        threshold: of the change, nats; 0 drops nothing.
-        reference: ``processed``, the last frame that SLAM has seen, against which changes add up;
-            or ``previous``, the frame before, dropped or not, as the paper words it. Under that a
-            slow motion is never seen: each frame is like the one before it, and ``max_skip`` alone
+        threshold: least change of a processed frame, nats; 0 drops nothing.
+        reference: ``processed``, the last processed frame, from which changes add up; or
+            ``previous``, the frame before, dropped or not, as the paper words it. With ``previous``
+            slow motion goes unnoticed: each frame is like the one before, and only ``max_skip``
             lets one through.
-        change: how it is measured.
-        levels: file that an exploration wrote, whose threshold is taken; None from then on.
+        change: how the change is measured.
+        levels: file written by a design-space exploration, whose threshold is used; reset to None
+            once read.
     """
 
     name: str = field(default="divergence", init=False)
@@ -242,7 +243,7 @@ class DivergenceFilterConfig(DroppingConfig):
         super().__post_init__()
 
     def make_filter(self, intrinsics: Intrinsics) -> FrameFilter:
-        """The filter for frames of ``intrinsics``."""
+        """Make the filter for frames of ``intrinsics``."""
         change = Change(self.change, intrinsics)
         return DivergenceFilter(self.threshold, change, self.reference == "previous")
 

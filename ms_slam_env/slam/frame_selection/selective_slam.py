@@ -1,4 +1,4 @@
-"""A SLAM backend that is shown only some of the frames, and the interface of what chooses them."""
+"""A SLAM backend that sees only selected frames, and the interface of frame filters."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from ms_slam_env.slam.slam_backend import BorrowedMap, SlamBackend, TrackResult
 class FrameFilter(Stateful):
     """Decides, frame by frame, whether SLAM processes it.
 
-    The first frame, those while tracking is lost and those after the longest permitted gap are
-    processed whatever the filter says; it is asked about them all the same.
+    The first frame, frames while tracking is lost and those after the longest permitted gap are
+    always processed; the filter is still asked about them.
     """
 
     @abstractmethod
@@ -35,29 +35,29 @@ class FrameFilter(Stateful):
 
     @abstractmethod
     def admits(self, frame: RGBDFrame, dropped: int, forced: bool = False) -> bool:
-        """Whether ``frame`` is to be processed.
+        """Whether to process ``frame``.
 
         Args:
             frame: the sensor's frame.
             dropped: frames that were dropped since the last processed one.
-            forced: the frame is processed whatever the answer is; the filter takes note.
+            forced: whether the frame is processed whatever the answer; the filter records it.
         """
 
     def charge(self, seconds: float) -> None:
-        """Take note of the processor time that the last frame took, its judgement included."""
+        """Record the last frame's processor time, including the filter's own."""
 
 
 PREDICTIONS = ("last", "constant-velocity")
-"""Poses that a dropped frame may be given."""
+"""Kinds of pose prediction for dropped frames."""
 
 
 class PosePrediction(Saved):
-    """Carries the last processed pose on.
+    """Extrapolates the last processed pose.
 
     Args:
-        is_moving: on with the velocity between the last two processed frames, but no further than
-            the camera moved between them; else at rest. A frame dropped for its likeness cannot be
-            far away: without the limit a camera that stops is carried on.
+        is_moving: move with the velocity between the last two processed frames, but no farther than
+            the camera moved between them; otherwise stay at rest. A frame dropped as similar cannot
+            be far away; without the limit a camera that stops would drift on.
     """
 
     saved = ("_pose", "_twist", "_frames")
@@ -69,7 +69,7 @@ class PosePrediction(Saved):
     def reset(self) -> None:
         """Forget every pose."""
         self._pose: Float64 = np.eye(4)
-        self._twist: Float64 = np.zeros(6)  # of the last motion, which took so many frames:
+        self._twist: Float64 = np.zeros(6)  # last motion, over this many frames:
         self._frames = 1
 
     def state_like(self) -> Any:
@@ -77,10 +77,10 @@ class PosePrediction(Saved):
         return super().state_like() | {"frames": WholeNumber(least=1)}
 
     def observe(self, T_world_camera: Float64, frames: int, continues: bool) -> None:
-        """Note the pose of a processed frame, ``frames`` after the one before.
+        """Record the pose of a processed frame, ``frames`` after the one before.
 
-        ``continues`` tells whether the motion between them was the camera's: not at the start, and
-        not across lost tracking or a closed loop.
+        ``continues`` says whether the motion between them is the camera's own; it is not at the
+        start, across lost tracking or across a closed loop.
         """
         if self._is_moving and continues:
             self._twist = se3_log(invert(self._pose) @ T_world_camera)
@@ -96,25 +96,26 @@ class PosePrediction(Saved):
         return self._pose @ se3_exp(min(1.0, frames / self._frames) * self._twist)
 
     def guess(self, frames: int) -> Float64 | None:
-        """The same as a guess for tracking; None where no motion is known."""
+        """The same pose as an initial guess for tracking; None if no motion is known."""
         return self.pose(frames) if self._twist.any() else None
 
 
 class SelectiveSlam(Saved, BorrowedMap):
     """A backend behind a filter: active frame management (Saeedi et al., ICRA 2017, section V-A).
 
-    A dropped frame is not shown to the backend; its result has ``processed`` False and a predicted
-    pose, and repeats of the last processed frame's what a prediction cannot know. Every frame is
-    processed until the backend has started and while its tracking is lost.
+    The backend does not see dropped frames. Their result has ``processed`` False and a predicted
+    pose; its other fields repeat the last processed frame's. Every frame is processed until the
+    backend has started and while its tracking is lost.
 
-    The frame after a gap is tracked from the predicted pose too, where the caller has no guess: the
-    backend's own idea of the motion spans the gap before, which may have been longer or shorter.
+    If the caller has no guess, the frame after a gap is also tracked from the predicted pose,
+    because the backend's own motion model spans the previous gap, which may be longer or shorter.
 
     Args:
-        backend: any; whoever holds it as well must not feed it frames.
-        frame_filter: says which frames are worth processing.
+        backend: any backend; nothing else may feed it frames.
+        frame_filter: decides which frames to process.
         max_skip: most frames dropped in a row.
-        pose: of a dropped frame without a known or guessed pose, ``constant-velocity`` or ``last``.
+        pose: prediction for a dropped frame without a known or guessed pose, ``constant-velocity``
+            or ``last``.
     """
 
     saved: ClassVar[tuple[str, ...]] = ("backend", "_filter", "_prediction", "_frames")
@@ -135,13 +136,13 @@ class SelectiveSlam(Saved, BorrowedMap):
         self._forget()
 
     def _forget(self) -> None:
-        """Be as before the first frame."""
+        """Return to the state before the first frame."""
         self._filter.reset()
         self._prediction.reset()
         self._frames = 0  # since reset
-        self._last: TrackResult | None = None  # of a processed frame
-        self._processed: list[int] = []  # the frames that the backend has counted
-        self._offsets: dict[int, Float64] = {}  # of dropped frames from the processed one before
+        self._last: TrackResult | None = None  # of the last processed frame
+        self._processed: list[int] = []  # frames that the backend has counted
+        self._offsets: dict[int, Float64] = {}  # of dropped frames from the last processed one
 
     def reset(self, T_world_camera: ArrayLike | None = None) -> None:
         """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
@@ -162,7 +163,7 @@ class SelectiveSlam(Saved, BorrowedMap):
         return self._process_or_drop(frame, T_world_camera_guess, process)
 
     def fuse(self, frame: RGBDFrame, T_world_camera: ArrayLike) -> TrackResult:
-        """Fuse ``frame`` into the map at a known pose (4, 4), or drop it; nothing is tracked."""
+        """Fuse ``frame`` into the map at a known pose (4, 4) without tracking, or drop it."""
         check_pose(T_world_camera, "T_world_camera")
         process = partial(self.backend.fuse, frame, T_world_camera)
         return self._process_or_drop(frame, T_world_camera, process)
@@ -204,7 +205,7 @@ class SelectiveSlam(Saved, BorrowedMap):
         return replace(result, loop=replace(result.loop, reference=reference))
 
     def _drop(self, known_pose: ArrayLike | None) -> TrackResult:
-        """Say what can be said of a frame that is not processed."""
+        """Make the result of a dropped frame."""
         assert self._last is not None  # the first frame is processed
         pose = self._prediction.pose(self._dropped + 1)
         if known_pose is not None:
@@ -230,7 +231,7 @@ class SelectiveSlam(Saved, BorrowedMap):
         return self.backend.map_points()
 
     def submaps(self) -> Submaps:
-        """The backend's submaps; their frames are counted since ``reset`` with the dropped ones."""
+        """The backend's submaps; frame numbers count from ``reset`` and include dropped frames."""
         own = self.backend.submaps()
         counted = np.array(self._processed or [0], dtype=np.int32)
         joined = np.where(own.joined_at >= 0, counted[own.joined_at], -1).astype(np.int32)
@@ -238,40 +239,40 @@ class SelectiveSlam(Saved, BorrowedMap):
 
     @property
     def frames_counted(self) -> int:
-        """Number of the next frame, with the dropped ones."""
+        """Number of the next frame, counting dropped ones."""
         return self._frames
 
     @property
     def needs_color(self) -> bool:
-        """Whether the backend needs it."""
+        """Whether the backend needs colour."""
         return self.backend.needs_color
 
     @property
     def closes_loops(self) -> bool:
-        """Whether the backend does."""
+        """Whether the backend closes loops."""
         return self.backend.closes_loops
 
     def mark_lost(self) -> None:
-        """Show the backend the next frame, and let it seek it in the map."""
+        """Treat tracking as lost; the backend sees the next frame."""
         self._last = None
         self.backend.mark_lost()
 
     def save(self, path: str | Path) -> None:
-        """Write the backend's map; the filter is no part of it."""
+        """Write the backend's map, without the filter's state."""
         self.backend.save(path)
 
     def load(self, path: str | Path, lost: bool = True) -> None:
-        """Take the backend's map from a file; the filter begins anew."""
+        """Load the backend's map from a file; the filter restarts."""
         self.backend.load(path, lost)
         self._forget()
         self._frames = self.backend.frames_counted
         self._processed = list(range(self._frames))
 
     def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
-        """Frames (N,), counted since ``reset`` with the dropped ones, and their poses (N, 4, 4).
+        """Frame numbers (N,), counted from ``reset`` with dropped frames, and poses (N, 4, 4).
 
-        A dropped frame moves with the processed one before it; where the backend corrects that one,
-        the dropped one is among the frames too.
+        A dropped frame moves with the processed one before it, and is included if the backend
+        corrects that one.
         """
         own, poses = self.backend.corrected_trajectory()
         corrected = {self._processed[k]: pose for k, pose in zip(own, poses, strict=True)}
@@ -288,7 +289,7 @@ class SelectiveSlam(Saved, BorrowedMap):
         return self._processed[int(np.searchsorted(self._processed, frame)) - 1]
 
     def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
+        """Return everything needed to continue bit-exactly, as NumPy arrays and plain values."""
         last = self._last
         return super().get_state() | {
             "last": None if last is None else _copied(vars(last)),
@@ -311,7 +312,7 @@ class SelectiveSlam(Saved, BorrowedMap):
         return Fields(super().state_like() | like, _why_no_selection)
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state of the same backend behind the same filter."""
+        """Restore a state of the same backend behind the same filter."""
         check_has(state, self.also_saved, type(self).__name__)
         super().set_state(state)
         self._last = None if state["last"] is None else TrackResult(**_copied(state["last"]))
@@ -320,7 +321,7 @@ class SelectiveSlam(Saved, BorrowedMap):
 
 
 def _why_no_selection(state: dict[str, Any]) -> str:
-    """What is wrong between the frames of a state that were processed and all."""
+    """What is inconsistent between a state's processed frames and its frame count."""
     processed, frames = state["processed"], state["frames"]
     if (np.diff(processed) <= 0).any() or (processed >= frames).any():
         return f"has processed frames that are not among its {frames}, in order"
@@ -334,6 +335,6 @@ def _why_no_selection(state: dict[str, Any]) -> str:
 
 
 def _copied(values: dict[str, Any]) -> dict[str, Any]:
-    """Fields of a ``TrackResult`` but for its loop, which is said once."""
+    """Fields of a ``TrackResult`` except its loop, which is reported once."""
     copies = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in values.items()}
     return {k: v for k, v in copies.items() if k != "loop"}

@@ -1,4 +1,4 @@
-"""RGB-D odometry against keyframes: what SLAM is measured against."""
+"""RGB-D keyframe odometry, the baseline for SLAM."""
 
 from ms_slam_env.slam.odometry.odometry import OdometryConfig, OdometrySlam
 

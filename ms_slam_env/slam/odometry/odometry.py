@@ -1,6 +1,6 @@
-"""RGB-D odometry against keyframes, as a backend: what SLAM is measured against.
+"""RGB-D keyframe odometry as a backend, the baseline for SLAM.
 
-Every frame is aligned with the keyframe; failing that with the last good frame; failing that with
+Every frame is aligned with the keyframe; failing that, with the last good frame; failing that, with
 views of the map, from the caller's guess and from poses around the last one. The map holds the
 keyframes' readings at their estimated poses; errors add up from keyframe to keyframe.
 """
@@ -32,18 +32,18 @@ _TOO_LITTLE_IN_VIEW = "too little of the map is in view"
 
 @dataclass(frozen=True)
 class OdometryConfig(Checked):
-    """Parameters of tracking and of the map of keyframes.
+    """Parameters of tracking and of the keyframe map.
 
     Attributes:
         depth_cutoff_m: readings beyond are ignored.
-        keyframe_m: the keyframe is renewed when the camera is this far from it,
-        keyframe_deg: or turned by this much.
+        keyframe_m: distance from the keyframe at which a new one starts.
+        keyframe_deg: rotation from the keyframe at which a new one starts.
         max_surfels: capacity of the map; None as in ``SurfelConfig``.
-        aligner: what aligns two images: ``opencv`` (depth and intensity of all pixels) or
-            ``semi-dense`` (intensity of pixels with a marked gradient, as LSD-SLAM tracks).
-        stock: OpenCV's odometry as it is: every motion that it returns is believed, whatever the
-            shares above, nothing is sought in views of the map, and a frame that it cannot align
-            becomes the keyframe where the camera was last.
+        aligner: how two images are aligned: ``opencv`` (depth and intensity of all pixels) or
+            ``semi-dense`` (intensity of pixels with a strong gradient, as in LSD-SLAM).
+        stock: unmodified OpenCV odometry: every motion that it returns is accepted without checks,
+            views of the map are not used, and a frame that it cannot align becomes the keyframe at
+            the last pose.
     """
 
     depth_cutoff_m: float = bounded(4.0, 0.1, LARGEST_CUTOFF_M)
@@ -56,7 +56,7 @@ class OdometryConfig(Checked):
 
 @dataclass(frozen=True)
 class PreparedImage:
-    """An image and what the aligner made of it."""
+    """An image, and its form prepared by the aligner."""
 
     image: DepthImage
     pyramids: Any
@@ -66,10 +66,10 @@ class ImageAligner(Protocol):
     """Finds the motion between two images."""
 
     def prepare(self, image: DepthImage) -> Any:
-        """What ``align`` takes of an image."""
+        """Prepare an image for ``align``."""
 
     def align(self, frame: Any, reference: Any) -> Float64 | None:
-        """T_reference_frame (4, 4), searched from rest, or None if there is none."""
+        """Align from rest; return T_reference_frame (4, 4) or None."""
 
 
 class Aligner:
@@ -89,7 +89,7 @@ class Aligner:
         )
 
     def prepare(self, image: DepthImage) -> cv2.OdometryFrame:
-        """Build the pyramids of an image; ``align`` takes images so prepared."""
+        """Build an image's pyramids for ``align``."""
         depth = np.where(image.depth > 0, image.depth, np.float32(np.nan))
         grey = np.clip(np.rint(image.intensity), 0, 255).astype(np.uint8)
         pyramids = cv2.OdometryFrame(depth, grey)
@@ -116,7 +116,7 @@ class _Placed:
 
 
 class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
-    """Keyframe odometry through OpenCV, its keyframes fused into a surfel map."""
+    """Keyframe odometry with OpenCV; keyframes are fused into a surfel map."""
 
     saved = (*FrameByFrameSlam.saved, "_map")
     also_saved = ("key", "last")
@@ -166,7 +166,7 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
                 yield self._confirmed(frame, reference)
 
     def _confirmed(self, frame: PreparedImage, reference: _Placed) -> Attempt[_Placed]:
-        """Align with a view of the map, then, if it may be right, with the view from there."""
+        """Align with a view of the map; if plausible, align again with the view from the result."""
         attempt = self._align(frame, reference, self._thresholds.tentative)
         if attempt.reason:
             return attempt
@@ -177,7 +177,7 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
     def _rendered(
         self, image: DepthImage, last: _Placed, guess: Float64 | None
     ) -> Iterator[_Placed]:
-        """Views of the map to align ``image`` with where the earlier frames fail."""
+        """Views of the map to align ``image`` with if the earlier frames fail."""
         if guess is not None:
             yield from self._views(guess[None])
         if not self._searches:
@@ -187,7 +187,7 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
         yield from self._views(last.T_world_image @ motions)
 
     def _views(self, poses: Float64) -> Iterator[_Placed]:
-        """Views of the map from poses (N, 4, 4), those with enough in them."""
+        """Views of the map from poses (N, 4, 4), if they show enough."""
         views = self._map.predict(poses)
         for pose, depth, intensity in zip(poses, views.depth, views.intensity, strict=True):
             image = DepthImage(depth, intensity)
@@ -243,7 +243,7 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
         return super().state_like() | {"key": placed, "last": placed}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state of a backend of the same intrinsics and configuration."""
+        """Restore the state of a backend with the same intrinsics and configuration."""
         super().set_state(state)
         self._key = self._restore(state["key"])
         self._last = self._key if state["last"] is None else self._restore(state["last"])
@@ -256,7 +256,7 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
 
 
 def _save(placed: _Placed | None) -> dict[str, Any] | None:
-    """An image and its pose as arrays; OpenCV's pyramids follow from them."""
+    """An image and its pose as arrays; pyramids are rebuilt from them."""
     if placed is None:
         return None
     image = placed.prepared.image

@@ -1,13 +1,13 @@
 """Semi-dense direct alignment of two RGB-D images: LSD-SLAM's tracking, with the sensor's depth.
 
-Engel, Schoeps and Cremers, "LSD-SLAM" (ECCV 2014), section 3.3: the points p of the reference that
-have a marked grey gradient and a depth are carried into the frame,
+Engel, Schoeps and Cremers, "LSD-SLAM" (ECCV 2014), section 3.3: the points p of the reference with
+a strong grey gradient and a depth are transformed into the frame,
 
     r(p) = I(pi(T p)) - I_ref(p)
     E    = sum Huber(r / s),   s^2 = 2 s_I^2 + (dr/dz s_z)^2
 
-minimised over T by Gauss-Newton, coarse to fine. Depth and its variance s_z^2 are the sensor's
-(Nguyen et al. 2012), not filtered over many frames, so that scale is known and T is in SE(3).
+minimised over T by Gauss-Newton, coarse to fine. Depth and its variance s_z^2 come from the sensor
+(Nguyen et al. 2012) instead of a filter over many frames, so scale is known and T is in SE(3).
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from ms_slam_env.camera.frame import reduce_depth
 from ms_slam_env.geometry import invert, se3_exp
 from ms_slam_env.slam.shared.alignment_measures import DepthImage
 
-ITERATIONS = (8, 12, 20)  # at most, finest level first
-_GRADIENT = 5.0  # grey levels a pixel, from which on a pixel is a point, as in LSD-SLAM
-_DEPTH_EDGE = 0.05  # share of the depth by which it changes there within a pixel
+ITERATIONS = (8, 12, 20)  # most per level, finest first
+_GRADIENT = 5.0  # least gradient of a point, grey levels per pixel, as in LSD-SLAM
+_DEPTH_EDGE = 0.05  # relative change of depth per pixel that marks an edge
 _SIGMA_I = 4.0  # noise of a grey value
-_HUBER = 1.5  # standard deviations from which on the loss is linear
+_HUBER = 1.5  # standard deviations beyond which the loss is linear
 _FEWEST_POINTS = 60
 _SMALLEST_STEP = 1e-4  # metres and radians
 _SMALLEST_SIDE = 12  # pixels of the coarsest level
@@ -35,12 +35,12 @@ _SMALLEST_SIDE = 12  # pixels of the coarsest level
 
 @dataclass(frozen=True)
 class SemiDenseLevel:
-    """An image at one size, and its points.
+    """One pyramid level of an image, and its points.
 
     Attributes:
-        intrinsics: of it.
+        intrinsics: intrinsics of the level.
         image: (h, w, 3) grey value, and its gradients to the right and down.
-        points: (N, 3) metres, of the pixels with a marked gradient and a depth.
+        points: (N, 3) metres, from the pixels with a strong gradient and a depth.
         grey: (N,) their grey values.
     """
 
@@ -51,7 +51,7 @@ class SemiDenseLevel:
 
 
 class SemiDenseAligner:
-    """Finds the motion between two images; stands in for ``odometry.Aligner``."""
+    """Finds the motion between two images; a substitute for ``odometry.Aligner``."""
 
     def __init__(self, intrinsics: Intrinsics) -> None:
         shortest = min(intrinsics.shape)
@@ -59,19 +59,20 @@ class SemiDenseAligner:
         self._cameras = [intrinsics.resized(*intrinsics.level_size(k)) for k in levels]
 
     def prepare(self, image: DepthImage) -> list[SemiDenseLevel]:
-        """An image at all levels, finest first."""
+        """Build all pyramid levels of an image, finest first."""
         return [_level(image, K) for K in self._cameras]
 
     def align(self, frame: list[SemiDenseLevel], reference: list[SemiDenseLevel]) -> Float64 | None:
-        """T_reference_frame (4, 4), searched from rest; None where too few points are in view or
-        they leave the pose open."""
+        """Align from rest; return T_reference_frame (4, 4).
+
+        None if too few points are in view or they do not constrain the pose."""
         T = np.eye(4)  # T_frame_reference
         for level in reversed(range(len(frame))):
             for _ in range(ITERATIONS[level]):
                 step = _step(frame[level], reference[level], T)
                 if step is None and level == 0:
                     return None
-                if step is None:  # a small image may have few points; the finer ones decide
+                if step is None:  # a small image may have few points; finer levels decide
                     break
                 T = se3_exp(step) @ T
                 if np.linalg.norm(step) < _SMALLEST_STEP:
@@ -80,14 +81,14 @@ class SemiDenseAligner:
 
 
 def _level(image: DepthImage, K: Intrinsics) -> SemiDenseLevel:
-    """The image at the size of ``K``."""
+    """Build the level with the image size of ``K``."""
     grey, depth, size = image.intensity.astype(np.float32), image.depth, (K.width, K.height)
     if image.depth.shape != K.shape:
         grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
         depth = reduce_depth(depth, size)
     right = 0.5 * cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=1)
     down = 0.5 * cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=1)
-    window = np.ones((3, 3), np.uint8)  # at the edge of an object the depth is either side's
+    window = np.ones((3, 3), np.uint8)  # at an object's edge the depth may belong to either side
     is_whole = cv2.dilate(depth, window) < (1 + _DEPTH_EDGE) * cv2.erode(depth, window)
     is_point = (np.hypot(right, down) > _GRADIENT) & is_whole
     points = (K.rays() * depth[..., None])[is_point]
@@ -112,7 +113,7 @@ def _step(
 def normal_equations(
     frame: SemiDenseLevel, reference: SemiDenseLevel, T_frame_reference: Float64
 ) -> tuple[Float64, Float64, float] | None:
-    """H (6, 6), g (6,) and the mean cost at a pose; None where too few points are in view."""
+    """H (6, 6), g (6,) and the mean cost at a pose; None if too few points are in view."""
     K, R = frame.intrinsics, T_frame_reference[:3, :3]
     q = reference.points @ R.T + T_frame_reference[:3, 3]
     pixels = K.project(np.where(q[:, 2:] > 0.05, q, (0.0, 0.0, -1.0)))
@@ -127,7 +128,7 @@ def normal_equations(
     across, along = right * K.fx * per_z, down * K.fy * per_z
     a = np.stack([across, along, -(across * q[:, 0] + along * q[:, 1]) * per_z], axis=1)
     sigma_z = 0.0012 + 0.0019 * (p[:, 2] - 0.4) ** 2
-    per_depth = np.einsum("nc,nc->n", a, p @ R.T) / p[:, 2]  # dr/dz of the reference's depth
+    per_depth = np.einsum("nc,nc->n", a, p @ R.T) / p[:, 2]  # dr/dz, z being the reference's depth
     sigma = np.sqrt(2 * _SIGMA_I**2 + (per_depth * sigma_z) ** 2)
     size = np.abs(r) / sigma
     weight = np.where(size <= _HUBER, 1, _HUBER / np.maximum(size, 1e-9)) / sigma**2
@@ -137,7 +138,7 @@ def normal_equations(
 
 
 def _interpolated(image: Float32, pixels: Float64) -> Float64:
-    """Values (N, c) of an image (h, w, c) at pixels (N, 2) inside of it, bilinear."""
+    """Interpolate an image (h, w, c) bilinearly at pixels (N, 2) inside it."""
     column, row = np.floor(pixels).astype(np.int64).T
     right, down = (pixels - np.floor(pixels)).T[..., None]
     top = (1 - right) * image[row, column] + right * image[row, column + 1]

@@ -1,1 +1,1 @@
-"""What the backends share: features, places seen before, decisions on alignments, states."""
+"""Parts that backends share: features, place recognition, alignment checks, saved states."""

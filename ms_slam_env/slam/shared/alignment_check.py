@@ -1,9 +1,9 @@
-"""Whether an alignment is right: what is measured of one, and the one decision on it.
+"""Decides whether to accept an alignment, from its measured statistics.
 
 Registration returns a pose for nearly any pair of images. Every backend measures what a pose
-explains (``AlignmentStatistics``), states what it demands (``AcceptanceThresholds``), and leaves
-the decision to ``evaluate_alignment``: odometry, volumetric and sparse SLAM on the host, the
-surfel tracker inside a kernel.
+explains (``AlignmentStatistics``), sets its requirements (``AcceptanceThresholds``), and leaves the
+decision to ``evaluate_alignment``: odometry, volumetric and sparse SLAM on the host, the surfel
+tracker inside a kernel.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FEWEST_READINGS = 0.05  # share of a frame's pixels that must have depth
 
 
 class TrackingStatus(IntEnum):
-    """Whether a frame was tracked, or the first demand that its alignment does not meet."""
+    """Whether a frame was tracked, or the first requirement that its alignment fails."""
 
     OK = 0
     FEW_POINTS = 1
@@ -35,7 +35,7 @@ class TrackingStatus(IntEnum):
 
 
 DISPUTED = (TrackingStatus.GEOMETRIC_MISMATCH, TrackingStatus.PHOTOMETRIC_MISMATCH)
-"""Refusals that a look at the map's view may overrule."""
+"""Rejections that a comparison with the map's view may overrule."""
 
 MAP_REASONS: dict[int, str] = {
     TrackingStatus.OK: "",
@@ -48,7 +48,7 @@ MAP_REASONS: dict[int, str] = {
     TrackingStatus.BLANK: "the image is black or blank",
     TrackingStatus.UNCERTAIN: "the frame fits the map, but not well enough to be fused",
 }
-"""The status in words where a frame was aligned with the map."""
+"""Text of each status for a frame aligned with the map."""
 
 VIEW_REASONS: dict[int, str] = MAP_REASONS | {
     TrackingStatus.LITTLE_OVERLAP: "the frame hardly overlaps the view that it is aligned with",
@@ -59,31 +59,32 @@ VIEW_REASONS: dict[int, str] = MAP_REASONS | {
         "the frame's intensity does not fit the view that it is aligned with"
     ),
 }
-"""The status in words where a frame was aligned with another image."""
+"""Text of each status for a frame aligned with another image."""
 
 
 @dataclass(frozen=True)
 class AlignmentStatistics:
-    """What an alignment explains of a frame; 0 where it was not measured."""
+    """Statistics of an alignment: how much of a frame it explains; 0 if not measured."""
 
     matches: float = 0.0  # number of matched points
     overlap: float = 0.0  # share of the frame's readings that land on a reading of the reference
-    inlier_ratio: float = 0.0  # share of those within the distance of its surface
-    # share of those so far in front of or behind it that no noise explains it.
+    inlier_ratio: float = 0.0  # share of those within tolerance of its surface
+    # share of those too far in front of or behind it for noise to explain.
     depth_conflict_ratio: float = 0.0
-    photometric_inlier_ratio: float = 0.0  # share of those with a like grey value
+    photometric_inlier_ratio: float = 0.0  # share of those with a similar grey value
     correlation: float = 0.0  # normalised, of the fine structure of both grey images
-    # standard deviation of their fine structure, of the image that has more, grey levels.
+    # standard deviation of fine structure in the image that has more, grey levels.
     texture: float = 0.0
     # RMS distance of the reference's surface from the plane that fits it best.
     relief_m: float = 0.0
     residual_m: float = 0.0  # RMS point-to-plane residual of the inliers, metres
     cost: float = 0.0  # mean truncated cost of the visible points, in [0, 3]
-    # standard deviation of the worst translation or rotation component that the view constrains.
+    # standard deviation of the worst-constrained translation or rotation component, leaving out
+    # directions that the view does not constrain.
     sigma_m: float = 0.0
-    # number of directions of the pose that it does not constrain.
+    # number of pose directions that the view does not constrain.
     degenerate_directions: float = 0.0
-    term_conflict: float = 0.0  # chi squared between the poses that geometry and intensity ask for
+    term_conflict: float = 0.0  # chi squared between the poses that geometry and intensity prefer
     motion_m: float = 0.0  # translation between frame and reference, metres
     rotation_cos: float = 0.0  # cosine of the angle between them
 
@@ -93,9 +94,9 @@ NO_ALIGNMENT = AlignmentStatistics()
 
 @dataclass(frozen=True)
 class AcceptanceThresholds:
-    """What an accepted alignment has: at least, or of what speaks against it at most.
+    """Requirements for accepting an alignment: minima, or maxima of what counts against it.
 
-    By default nothing is demanded. See ``AlignmentStatistics``.
+    The defaults require nothing. See ``AlignmentStatistics``.
     """
 
     matches: float = 0.0
@@ -113,7 +114,7 @@ class AcceptanceThresholds:
 
     @property
     def tentative(self) -> AcceptanceThresholds:
-        """Laxer ones, for an alignment that is repeated from close by before it is accepted."""
+        """Looser thresholds for an alignment that must be confirmed by a second, nearby one."""
         return replace(
             self,
             inlier_ratio=0.8 * self.inlier_ratio,
@@ -122,7 +123,7 @@ class AcceptanceThresholds:
 
     @property
     def confirmation(self) -> AcceptanceThresholds:
-        """Those of the repetition, which must hardly move the pose; wrong poses drift on."""
+        """Thresholds of the second alignment: it may hardly move the pose; wrong poses drift on."""
         return replace(
             self,
             photometric_inlier_ratio=0.93 * self.photometric_inlier_ratio,
@@ -131,7 +132,7 @@ class AcceptanceThresholds:
         )
 
     def repeated(self, count: int) -> NDArray[Any]:
-        """The same (count,) times, as a structured array for ``DeviceThresholds``."""
+        """Repeat the thresholds ``count`` times as a structured array for ``DeviceThresholds``."""
         dtype = np.dtype([(field.name, np.float64) for field in fields(self)])
         return np.array([tuple(asdict(self).values())] * count, dtype=dtype)
 
@@ -143,33 +144,32 @@ VIEW_THRESHOLDS = AcceptanceThresholds(
     motion_m=0.3,
     rotation_cos=np.cos(np.radians(30.0)),
 )
-"""Of a frame aligned with another image, sensed or rendered."""
+"""Thresholds for a frame aligned with another image, captured or rendered."""
 
 CONSISTENCY_THRESHOLDS = AcceptanceThresholds(overlap=0.4, inlier_ratio=0.85, correlation=0.45)
-"""Of a frame laid upon the map's view from its pose; see ``measure_photometric_consistency``.
+"""Thresholds for a frame compared with the map's view (``measure_photometric_consistency``).
 
-In six scenes at 160x120 the correlation was at least 0.88 at true poses, but for a map that had
-drifted; with a rolling shutter, blur, misregistered colour, changing exposure and patches without
-depth, all at once, it was 0.5 or more at three of four. At poses that the tracker had come to,
-10 cm or 10 degrees off or in another scene, it was below 0.35 but for two of 307.
+In six scenes at 160x120 the correlation was at least 0.88 at true poses, except with a map that had
+drifted. With rolling shutter, blur, misregistered colour, changing exposure and patches without
+depth all at once, it was 0.5 or more at three of four. At wrong poses found by the tracker, 10 cm
+or 10 degrees off or in another scene, it was below 0.35 except for two of 307.
 """
 
 TEXTURELESS_THRESHOLDS = AcceptanceThresholds(overlap=0.4, inlier_ratio=0.95, relief_m=0.05)
-"""The same where there is nothing to correlate: depth alone must tell the place; planes look alike.
-"""
+"""The same without texture: depth alone must identify the place, and all planes look alike."""
 
 CONVINCING_CORRELATION = 0.7
-"""With this a frame that the tracker's thresholds refused is right after all.
+"""With this correlation a frame is accepted although the tracker's thresholds rejected it.
 
-``ms-slam experiment acceptance_roc``: of the frames that the thresholds refuse, that are nearly
-accepted (``AcceptanceConfig.doubted``) and have such a correlation, nearly all are right.
+``ms-slam experiment acceptance_roc``: of the rejected frames that were nearly accepted
+(``AcceptanceConfig.doubted``) and have this correlation, nearly all are right.
 """
 
 LEAST_TEXTURE = 2.0  # grey levels; with less there is nothing to correlate
 
 
 def _device_struct(cls: type) -> Any:
-    """The Warp struct with the fields of a dataclass, each a float64."""
+    """Make a Warp struct with the fields of a dataclass, each a float64."""
     annotations = {field.name: wp.float64 for field in fields(cls)}
     members = {"__annotations__": annotations, "__module__": __name__, "__doc__": cls.__doc__}
     return wp.struct(type(f"Device{cls.__name__}", (), members))
@@ -180,10 +180,10 @@ DeviceThresholds = _device_struct(AcceptanceThresholds)
 
 
 def evaluate_alignment(statistics: Any, thresholds: Any) -> int:
-    """The ``TrackingStatus`` of an alignment.
+    """Decide the ``TrackingStatus`` of an alignment.
 
-    On the host of ``AlignmentStatistics`` and ``AcceptanceThresholds``; in kernels the same lines
-    are ``evaluate_on_device``, of ``DeviceStatistics`` and ``DeviceThresholds``.
+    On the host it takes ``AlignmentStatistics`` and ``AcceptanceThresholds``; in kernels the same
+    code is ``evaluate_on_device`` and takes ``DeviceStatistics`` and ``DeviceThresholds``.
     """
     if statistics.matches < thresholds.matches:
         return TrackingStatus.FEW_POINTS
@@ -218,14 +218,14 @@ evaluate_on_device = wp.func(evaluate_alignment)
 
 
 def is_photometrically_consistent(found: AlignmentStatistics) -> bool:
-    """Whether a frame and the map's view show the same."""
+    """Whether a frame and the map's view show the same surface."""
     textured = found.texture >= LEAST_TEXTURE
     thresholds = CONSISTENCY_THRESHOLDS if textured else TEXTURELESS_THRESHOLDS
     return evaluate_alignment(found, thresholds) == TrackingStatus.OK
 
 
 def status_on_appeal(found: AlignmentStatistics) -> TrackingStatus:
-    """OK, UNCERTAIN or PHOTOMETRIC_MISMATCH: what the map's view says of a doubtful alignment."""
+    """Decide a doubtful alignment by the map's view: OK, UNCERTAIN or PHOTOMETRIC_MISMATCH."""
     if not is_photometrically_consistent(found):
         return TrackingStatus.PHOTOMETRIC_MISMATCH
     sure = found.texture >= LEAST_TEXTURE and found.correlation >= CONVINCING_CORRELATION

@@ -1,4 +1,4 @@
-"""What is measured of an alignment on the host; ``alignment_check`` decides on it."""
+"""Measures alignments on the host; ``alignment_check`` decides on them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ms_slam_env.slam.shared.alignment_check import (
     evaluate_alignment,
 )
 
-_PHOTOMETRIC_LEVELS = 20.0  # largest difference of grey values once their median is taken away
+_PHOTOMETRIC_LEVELS = 20.0  # largest difference of grey values after subtracting the median
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 _WINDOW = 11  # pixels of the view; variations over longer distances are shading, not texture
 _SMOOTHING = 3
@@ -28,7 +28,7 @@ _FEWEST_PIXELS = 100
 
 @dataclass(frozen=True)
 class DepthImage:
-    """A depth image with its intensity, sensed or rendered."""
+    """A depth image with its intensity, captured or rendered."""
 
     depth: Float32  # (H, W) float32 metres; 0 = no reading
     intensity: Float32  # (H, W) float32 in [0, 255]
@@ -41,14 +41,14 @@ class DepthImage:
 
 @dataclass(frozen=True)
 class Overlay:
-    """Readings of a frame that motions lay on a reference, those of the first motion first.
+    """Depth readings of a frame, transformed by M motions and projected into a reference.
 
     Attributes:
-        looked_at: readings of the frame that each motion carries.
-        counts: (M,) those of them that land on a reading of the reference, of each motion.
-        inlier: (sum of counts,) whether they lie on its surface.
-        alike: (sum of counts,) whether they look like it.
-        residual: (sum of counts,) metres from its surface.
+        looked_at: number of readings transformed by each motion.
+        counts: (M,) number of them that land on a reading of the reference, for each motion.
+        inlier: (sum of counts,) whether each of these lies on its surface, ordered by motion.
+        alike: (sum of counts,) whether each has a similar grey value.
+        residual: (sum of counts,) distance of each from its surface, metres.
     """
 
     looked_at: int
@@ -59,7 +59,7 @@ class Overlay:
 
     @property
     def scores(self) -> Float64:
-        """Of each motion (M,): overlap times the sum of both ratios; 0 where nothing overlaps."""
+        """Score (M,) of each motion: overlap times the sum of both ratios; 0 without overlap."""
         which = np.repeat(np.arange(len(self.counts)), self.counts)
         good = [
             np.bincount(which[fits], minlength=len(self.counts)) / np.maximum(self.counts, 1)
@@ -75,7 +75,7 @@ def overlay(
     intrinsics: Intrinsics,
     samples: int,
 ) -> Overlay:
-    """Lay about ``samples`` readings of a frame on a reference by each motion (M, 4, 4)."""
+    """Project about ``samples`` readings of a frame into a reference by each motion (M, 4, 4)."""
     v, u = np.nonzero(frame.depth > 0)
     step = max(1, len(v) // samples)
     v, u = v[::step], u[::step]
@@ -86,7 +86,7 @@ def overlay(
     pixels = np.full((*ahead.shape, 2), -1.0)
     pixels[ahead] = intrinsics.project(moved[ahead])
     column, row = np.moveaxis(np.clip(np.rint(pixels), -1, 1e6).astype(np.int64), -1, 0)
-    # The last row and column have no neighbour to take the normal from.
+    # The last row and column lack the neighbour needed for the normal.
     seen = (column >= 0) & (column < intrinsics.width - 1)
     seen &= (row >= 0) & (row < intrinsics.height - 1)
     seen[seen] = reference.depth[row[seen], column[seen]] > 0
@@ -115,9 +115,9 @@ def measure_alignment(
 ) -> AlignmentStatistics:
     """Compare a frame with a reference of the same camera by projective association.
 
-    A reading is an inlier within 2 cm + 1 cm/m^2 of the reference's surface, the axial noise of
-    structured light growing with depth squared. About ``samples`` readings are looked at; more
-    than the default do not change the decision.
+    A reading is an inlier within 2 cm + 1 cm/m^2 of the reference's surface, since the axial noise
+    of structured light grows with depth squared. About ``samples`` readings are compared; more than
+    the default do not change the decision.
     """
     motion = AlignmentStatistics(
         motion_m=float(np.linalg.norm(T_reference_frame[:3, 3])),
@@ -144,7 +144,7 @@ def check_alignment(
     thresholds: AcceptanceThresholds,
     samples: int = 5000,
 ) -> tuple[AlignmentStatistics, str]:
-    """What ``measure_alignment`` finds, and why that is not accepted; empty if it is."""
+    """Measure an alignment, and say why it is not accepted; empty if it is."""
     found = measure_alignment(frame, reference, T_reference_frame, intrinsics, samples)
     return found, VIEW_REASONS[evaluate_alignment(found, thresholds)]
 
@@ -152,7 +152,7 @@ def check_alignment(
 def _back_project(
     u: NDArray[np.int64], v: NDArray[np.int64], depth: Float64, intrinsics: Intrinsics
 ) -> Float64:
-    """Points (N, 3) of pixels with a depth, camera frame."""
+    """Points (N, 3) in the camera frame from pixels with depth."""
     return intrinsics.rays_at(np.stack([u, v], axis=1)) * depth[:, None]
 
 
@@ -186,18 +186,18 @@ def measure_photometric_consistency(
     view_depth: Float32,
     cutoff_m: float,
 ) -> AlignmentStatistics:
-    """Lay a frame upon the map's view from its pose, pixel by pixel.
+    """Compare a frame with the map's view from its pose, pixel by pixel.
 
-    The tracker explains a frame with a gain and a bias of its own, and self-similar textures fit
-    themselves at many places about as well as noise permits. Here the images are compared once
-    more, without that freedom. A reading is an inlier within 2 cm + 2 cm/m^2 of the view's depth.
+    The tracker fits a gain and a bias for each frame, and self-similar textures match themselves at
+    many places almost to within noise. Here the images are compared again without that freedom. A
+    reading is an inlier within 2 cm + 2 cm/m^2 of the view's depth.
 
     Args:
         color: (H, W, 3).
         depth: (H, W) metres; 0 = no reading.
         view_intensity: (h, w) every n-th row and column of the camera's image.
         view_depth: (h, w) metres; 0 where the map is empty.
-        cutoff_m: readings beyond are no part of the map.
+        cutoff_m: readings beyond are not part of the map.
     """
     step = -(-depth.shape[0] // view_depth.shape[0])
     sensed = depth[::step, ::step]

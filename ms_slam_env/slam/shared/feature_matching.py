@@ -1,4 +1,4 @@
-"""Matching of ORB descriptors, where they are expected or anywhere; and of whole images."""
+"""Matches ORB descriptors, near an expected position or anywhere, and whole images."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ms_slam_env.slam.shared.alignment_measures import DepthImage
 
 Descriptors = NDArray[np.uint64]
 
-_NEIGHBOURS = 8  # features compared with a projected point at most
+_NEIGHBOURS = 8  # most features compared with a projected point
 _RATIO = 0.9  # the best match must be this much better than the second best
 _SIZE = (16, 12)  # of a thumbnail, pixels
 
@@ -32,18 +32,18 @@ def match_near(
     radius_px: float,
     hamming: int,
 ) -> tuple[Int64, Int64]:
-    """Match points with features near where they project to.
+    """Match points with features near their projections.
 
     Args:
         projected: (P, 2) pixels.
         wanted: (P, 4) descriptors of the points.
-        tree: of the features' pixels.
+        tree: k-d tree of the features' pixels.
         descriptors: (N, 4) of the features.
-        radius_px: features farther away are not looked at.
-        hamming: largest distance of a match.
+        radius_px: features farther away are not compared.
+        hamming: largest Hamming distance of a match.
 
     Returns:
-        Indices (M,) of points and of the features that they match; each occurs once.
+        Indices (M,) of points and of their matching features; each occurs once.
     """
     if len(projected) == 0 or len(descriptors) == 0:
         return _no_match()
@@ -78,7 +78,7 @@ def match_anywhere(a: Descriptors, b: Descriptors, hamming: int) -> tuple[Int64,
 
 
 def _one_to_one(points: Int64, features: Int64, distance: Int64) -> tuple[Int64, Int64]:
-    """Leave every feature to the point that resembles it most."""
+    """Assign each feature only to its most similar point."""
     order = np.lexsort((points, distance))
     _, first = np.unique(features[order], return_index=True)
     kept = np.sort(order[first])
@@ -90,7 +90,7 @@ def _no_match() -> tuple[Int64, Int64]:
 
 
 def thumbnail(image: DepthImage) -> Float32:
-    """Unit vector (D,) of an image's looks: its brightness and its nearness, coarsely."""
+    """Reduce an image to a unit vector (D,) of coarse brightness and inverse depth."""
     depth = image.depth
     nearness = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
     parts = []
@@ -103,7 +103,7 @@ def thumbnail(image: DepthImage) -> Float32:
 
 
 def most_alike(wanted: Float32, others: Sequence[Float32], count: int) -> list[int]:
-    """Indices of the ``count`` thumbnails that resemble one most, best first."""
+    """Indices of the ``count`` most similar thumbnails, best first."""
     if not len(others):
         return []
     scores = np.stack(others) @ wanted

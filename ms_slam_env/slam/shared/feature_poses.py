@@ -1,4 +1,4 @@
-"""Where a frame was taken, from the ORB features that it shares with an earlier frame."""
+"""Camera poses from ORB features that a frame shares with an earlier frame."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import ListOf, WholeNumber
 
 _HAMMING = 60  # largest distance of matching descriptors, bits of 256
-_ERROR_PX = 2.5  # of a match that RANSAC counts
-_PIXEL_NOISE = 0.7  # of a corner of the finest level, as in ``SparseConfig``
+_ERROR_PX = 2.5  # largest reprojection error of a RANSAC inlier
+_PIXEL_NOISE = 0.7  # position noise of a corner of the finest level, as in ``sparse_config``
 _INVERSE_DEPTH_NOISE = 0.004  # 1/m
-STRONG_SUPPORT = 30  # matches that a pose explains,
-WIDE_SPREAD = 0.1  # and their standard deviation, share of the image, both across and down
+STRONG_SUPPORT = 30  # matches that a strongly supported pose explains
+WIDE_SPREAD = 0.1  # least standard deviation of their positions, share of the image, per axis
 
 
 @dataclass(frozen=True)
 class FeaturePose:
-    """A pose that features speak for."""
+    """A pose supported by feature matches."""
 
     T_reference_frame: Float64  # (4, 4)
     inliers: int  # matches that it explains, in the image and in depth
-    spread: float  # the smaller standard deviation of their places, share of the image's size
+    spread: float  # the smaller standard deviation of their positions, share of the image's size
 
     @property
     def is_strong(self) -> bool:
-        """Whether it can stand alone."""
+        """Whether its support suffices without other evidence."""
         return self.inliers >= STRONG_SUPPORT and self.spread >= WIDE_SPREAD
 
 
 def pose_from_features(
     reference: Features, frame: Features, intrinsics: Intrinsics
 ) -> FeaturePose | None:
-    """Pose of a frame relative to another, by PnP and RANSAC, refined with the depths of both.
+    """Estimate a frame's pose relative to another by PnP and RANSAC, refined with both depths.
 
-    None where too few features match. The same features give the same pose, bit for bit.
+    None if too few features match. The same features give the same pose, bit for bit.
     """
     known = reference.chosen(np.flatnonzero(reference.inverse_depth > 0))
     a, b = match_anywhere(known.descriptors, frame.descriptors, _HAMMING)
@@ -66,21 +66,21 @@ def pose_from_features(
 
 
 class FrameFeatures:
-    """Features of frames of one camera."""
+    """Extracts features from the frames of one camera."""
 
     def __init__(self, intrinsics: Intrinsics) -> None:
         self.intrinsics = intrinsics
         self._extract = FeatureExtractor(intrinsics)
 
     def features_of(self, image: NDArray[np.uint8], depth: Float32, cutoff_m: float) -> Features:
-        """Of a frame, grey (H, W) or in colour (H, W, 3); depth (H, W) counts up to a cutoff."""
+        """Features of a grey (H, W) or colour (H, W, 3) frame, with depth (H, W) up to a cutoff."""
         grey = image if image.ndim == 2 else grey_of(image)
         within = np.where(depth <= cutoff_m, depth, np.float32(0))
         return self._extract(grey, InverseDepth(within))
 
 
 def grey_of(color: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Grey image (H, W) of one in colour (H, W, 3)."""
+    """Convert a colour image (H, W, 3) to grey (H, W)."""
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY))
 
 
@@ -88,9 +88,10 @@ MOST_IMAGES = 100
 
 
 class KeyframeImages(FrameFeatures, Saved):
-    """Images of keyframes of one camera, whose features are sought when they are asked for.
+    """Keyframe images of one camera; features are extracted on request.
 
-    Beyond ``MOST_IMAGES`` every second one is dropped, so that they stay spread over the time.
+    When there are more than ``MOST_IMAGES``, every second one is dropped, so that they stay spread
+    over time.
     """
 
     saved = ("times", "_grey", "_depth")
@@ -107,7 +108,7 @@ class KeyframeImages(FrameFeatures, Saved):
         self._found: dict[tuple[int, float], Features] = {}
 
     def keep(self, color: NDArray[np.uint8], depth: Float32, time: int) -> None:
-        """Take the image of a keyframe."""
+        """Store a keyframe's image."""
         self.times.append(time)
         self._grey.append(grey_of(color))
         self._depth.append(depth.copy())
@@ -118,7 +119,7 @@ class KeyframeImages(FrameFeatures, Saved):
         self._found = {key: one for key, one in self._found.items() if key[0] in self.times}
 
     def features(self, time: int, cutoff_m: float) -> Features:
-        """Features of the keyframe of a time, which is one of ``times``."""
+        """Features of the keyframe at ``time``, which must be one of ``times``."""
         key, index = (time, cutoff_m), self.times.index(time)
         if key not in self._found:
             images = self._grey[index], self._depth[index]
@@ -126,7 +127,7 @@ class KeyframeImages(FrameFeatures, Saved):
         return self._found[key]
 
     def fitting(self, intrinsics: Intrinsics) -> KeyframeImages:
-        """Itself for a camera with these intrinsics, or one without images."""
+        """Return itself if the intrinsics match, otherwise an empty store for them."""
         return self if intrinsics == self.intrinsics else KeyframeImages(intrinsics)
 
     def state_like(self) -> Any:
@@ -139,13 +140,13 @@ class KeyframeImages(FrameFeatures, Saved):
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state; features are sought anew."""
+        """Restore a state; features are extracted again on request."""
         super().set_state(state)
         self._found = {}
 
 
 class LastFrames(Saved):
-    """The last frames with a known pose of B envs; features are sought when they are asked for."""
+    """The last frame with a known pose of each of B envs; features are extracted on request."""
 
     saved = ("_color", "_depth", "_poses")
 
@@ -156,7 +157,7 @@ class LastFrames(Saved):
         self.use(intrinsics)
 
     def use(self, intrinsics: Intrinsics) -> None:
-        """Expect frames of a camera; those of another size are forgotten."""
+        """Switch to a camera; stored frames of another size are dropped."""
         self._frames = FrameFeatures(intrinsics)
         size = (len(self._poses), *intrinsics.shape)
         if self._depth.shape != size:
@@ -171,7 +172,7 @@ class LastFrames(Saved):
         T_world_camera: Float64,
         known: NDArray[np.bool_],
     ) -> None:
-        """Take the frames (B, H, W) of the envs whose poses (B, 4, 4) are ``known`` (B,)."""
+        """Store the frames (B, H, W) of the envs whose poses (B, 4, 4) are ``known`` (B,)."""
         for own, new in ((self._color, color), (self._depth, depth), (self._poses, T_world_camera)):
             for env in np.flatnonzero(known):
                 own[env] = new[env]
@@ -182,17 +183,17 @@ class LastFrames(Saved):
         return self._color, self._depth
 
     def move(self, env: int, T_world_camera: Float64) -> None:
-        """Put an env's frame elsewhere (4, 4)."""
+        """Move an env's frame to another pose (4, 4)."""
         self._poses[env] = T_world_camera
 
     def forget(self, env: int) -> None:
-        """Have no frame of an env."""
+        """Drop an env's frame."""
         self._poses[env] = np.nan
 
     def find(
         self, env: int, color: NDArray[np.uint8], depth: Float32, cutoff_m: float
     ) -> tuple[Float64, FeaturePose] | None:
-        """Where (4, 4) T_world_camera a frame (H, W) was taken; None if features do not say."""
+        """Find T_world_camera (4, 4) of a frame (H, W) from features; None if they do not match."""
         if not np.isfinite(self._poses[env, 0, 0]):
             return None
         of = self._frames.features_of

@@ -1,4 +1,4 @@
-"""Keyframes found again by randomised ferns: for relocalisation and global loop closure.
+"""Keyframe retrieval by randomised ferns, for relocalisation and global loop closure.
 
 Glocker, Shotton, Criminisi, Izadi, "Real-Time RGB-D Camera Relocalization via Randomized Ferns for
 Keyframe Encoding", TVCG 2015: frames become codes of binary tests at random places; each fern
@@ -22,22 +22,22 @@ from ms_slam_env.geometry import check_pose
 from ms_slam_env.slam.shared.state import Stateful
 from ms_slam_env.slam.shared.state_check import ArrayOf
 
-_THRESHOLDS = (32.0, 224.0)  # on colours, after that
-_AVERAGED = 8  # rows and columns of the image, at least, that a reduced pixel is the mean of
+_THRESHOLDS = (32.0, 224.0)  # on colours, at mean brightness ``MEAN_LEVEL``
+_AVERAGED = 8  # least rows and columns of the image that a reduced pixel averages
 _FIRST_ROWS = 64
 
 
 @dataclass(frozen=True)
 class FernConfig(Checked):
-    """How frames are encoded and which of them are kept.
+    """How frames are encoded and which are kept as keyframes.
 
     Attributes:
-        num_ferns: places in the image that are tested; the code of each has four bits.
+        num_ferns: number of tested image positions; each contributes four bits to the code.
         columns: width of the reduced colour image that is tested, pixels.
         blur_px: standard deviation of the Gaussian that smooths the reduced image.
-        near_m: thresholds on depth are drawn between here
-        far_m: and here.
-        keyframe_dissimilarity: a frame is kept if it differs by more from every kept one.
+        near_m: lower bound of the random depth thresholds.
+        far_m: upper bound of the random depth thresholds.
+        keyframe_dissimilarity: a frame is kept if it differs by more than this from every kept one.
     """
 
     num_ferns: int = bounded(500, 1, 100_000)
@@ -57,7 +57,7 @@ class FernConfig(Checked):
 
 COLOUR_BITS = 7  # red 1, green 2, blue 4
 DEPTH_BIT = 8
-MEAN_LEVEL = 128.0  # frames are made this bright, on average, before they are tested
+MEAN_LEVEL = 128.0  # mean brightness that frames are normalised to before the tests
 
 
 @dataclass(frozen=True)
@@ -65,12 +65,12 @@ class FernCode:
     """The code of one frame."""
 
     bits: UInt8  # (F,) outcome of the four tests of each fern
-    # (F,) which of the four bits could be tested; depth cannot where it has no reading.
+    # (F,) which of the four bits are known; the depth bit is not where there is no reading.
     known: UInt8
 
 
 class FernEncoder:
-    """Encodes frames of one camera; places and thresholds are drawn from a seed."""
+    """Encodes frames of one camera; test positions and thresholds are drawn from a seed."""
 
     def __init__(self, intrinsics: Intrinsics, config: FernConfig, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
@@ -85,21 +85,21 @@ class FernEncoder:
         self.color_thresholds: Float64 = rng.uniform(*_THRESHOLDS, (config.num_ferns, 3))
         self.depth_thresholds: Float64 = rng.uniform(config.near_m, config.far_m, config.num_ferns)
         self._color_place = row * columns + column
-        # Depth is not averaged: a mean across an edge is no surface's depth.
+        # Depth is not averaged: a mean across an edge lies on no surface.
         v = ((row + 0.5) * height / rows).astype(np.int64)
         u = ((column + 0.5) * width / columns).astype(np.int64)
         self._depth_place = v * width + u
 
     @property
     def tested_size(self) -> tuple[int, int]:
-        """Width and height of the reduced image that is tested."""
+        """Width and height of the reduced colour image."""
         return self._size
 
     def encode(self, color: UInt8, depth: NDArray[np.float32]) -> FernCode:
-        """Code of a frame: colour (H, W, 3) uint8, depth (H, W) metres, 0 = no reading.
+        """Encode a frame: colour (H, W, 3) uint8, depth (H, W) metres, 0 = no reading.
 
-        Colours are divided by the frame's mean brightness: a change of exposure changes no bit,
-        but where it saturates.
+        Colours are divided by the frame's mean brightness, so a change of exposure changes no bit
+        except where the image saturates.
         """
         thinned = np.ascontiguousarray(color[:: self._step, :: self._step])
         small = cv2.resize(thinned, self._size, interpolation=cv2.INTER_AREA)
@@ -117,8 +117,8 @@ class FernEncoder:
 def dissimilarities(code: FernCode, bits: UInt8, known: UInt8) -> Float64:
     """Share of ferns (K,) at which ``code`` differs from each of K codes (K, F).
 
-    The paper's block-wise Hamming distance: a fern differs if any of its bits does.
-    Bits that either frame does not know are left out.
+    The paper's block-wise Hamming distance: a fern differs if any of its bits does. Bits unknown in
+    either frame are ignored.
     """
     different = (bits ^ code.bits) & (known & code.known)
     return np.count_nonzero(different, axis=1) / different.shape[1]
@@ -134,11 +134,11 @@ class Candidate:
     time: int  # when it was observed
 
 
-_ROWS = ("_bits", "_known", "_poses", "_times")  # arrays of a row for each keyframe
+_ROWS = ("_bits", "_known", "_poses", "_times")  # arrays with one row per keyframe
 
 
 class FernDatabase(Stateful):
-    """Keeps the frames that differ from all kept before, and finds those that resemble another.
+    """Keeps frames that differ from all kept before, and retrieves those similar to a query.
 
     The same seed draws the same ferns.
     """
@@ -174,10 +174,10 @@ class FernDatabase(Stateful):
         self._times = np.zeros(_FIRST_ROWS, dtype=np.int64)
 
     def expect_size(self, intrinsics: Intrinsics) -> None:
-        """Take frames of another size of the same camera from now on; the keyframes stay.
+        """Accept frames of another size of the same camera from now on; the keyframes stay.
 
         Raises:
-            InputError: frames of another shape, or smaller than those that ferns test.
+            InputError: another aspect ratio, or smaller than the reduced image.
         """
         encoder = FernEncoder(intrinsics, self.config, self._seed)
         if encoder.tested_size != self._encoder.tested_size:
@@ -188,17 +188,17 @@ class FernDatabase(Stateful):
         self._encoder = encoder
 
     def encode(self, color: UInt8, depth: NDArray[np.float32]) -> FernCode:
-        """Code of a frame, for the methods that take one: colour (H, W, 3), depth (H, W) metres."""
+        """Encode a frame for methods that take a code: colour (H, W, 3), depth (H, W) metres."""
         return self._encoder.encode(color, depth)
 
     def observe(
         self, color: UInt8, depth: NDArray[np.float32], T_world_camera: ArrayLike, time: int = 0
     ) -> bool:
-        """Keep a frame taken at ``T_world_camera`` (4, 4) if none that is kept resembles it."""
+        """Keep a frame at ``T_world_camera`` (4, 4) if no kept one is similar; return whether."""
         return self.observe_code(self.encode(color, depth), T_world_camera, time)
 
     def observe_code(self, code: FernCode, T_world_camera: ArrayLike, time: int = 0) -> bool:
-        """The same for a frame that is encoded already; return whether it was kept."""
+        """``observe`` for a frame already encoded; return whether it was kept."""
         pose = check_pose(T_world_camera, "T_world_camera")
         if self._count and self.dissimilarities(code).min() <= self.config.keyframe_dissimilarity:
             return False
@@ -214,12 +214,12 @@ class FernDatabase(Stateful):
     def candidates(
         self, color: UInt8, depth: NDArray[np.float32], count: int, before: int | None = None
     ) -> list[Candidate]:
-        """The at most ``count`` keyframes that resemble a frame most, the best first.
+        """Find the most similar keyframes, best first.
 
         Args:
             color: (H, W, 3) uint8.
             depth: (H, W) metres; 0 = no reading.
-            count: at most so many.
+            count: largest number to return.
             before: only keyframes observed before this time; all if None.
         """
         return self.candidates_of(self.encode(color, depth), count, before)
@@ -227,7 +227,7 @@ class FernDatabase(Stateful):
     def candidates_of(
         self, code: FernCode, count: int, before: int | None = None
     ) -> list[Candidate]:
-        """The same for a frame that is encoded already."""
+        """``candidates`` for a frame already encoded."""
         found = self.dissimilarities(code)
         if before is not None:
             found = np.where(self._times[: self._count] < before, found, np.inf)
@@ -245,7 +245,7 @@ class FernDatabase(Stateful):
         return dissimilarities(code, self._bits[: self._count], self._known[: self._count])
 
     def move(self, poses: ArrayLike) -> None:
-        """Put all keyframes at new poses (K, 4, 4), where a loop closure has bent the map."""
+        """Move all keyframes to new poses (K, 4, 4), after a loop closure has deformed the map."""
         stack = np.asarray(poses, dtype=np.float64)
         if stack.shape != (self._count, 4, 4):
             raise InputError(f"poses must have shape {(self._count, 4, 4)}, got {stack.shape}")
@@ -265,7 +265,7 @@ class FernDatabase(Stateful):
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state of a database of the same camera, configuration and seed."""
+        """Restore the state of a database with the same camera, configuration and seed."""
         self._count = len(state["bits"])
         for name in _ROWS:
             setattr(self, name, state[name[1:]].copy())

@@ -1,4 +1,4 @@
-"""Whether two maps, laid upon each other, show the same: by what cameras saw of each."""
+"""Checks whether two overlaid maps show the same place, by the frames they were built from."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from ms_slam_env.geometry import invert
 from ms_slam_env.slam.shared.alignment_measures import measure_photometric_consistency
 from ms_slam_env.slam.slam_backend import Views
 
-_LOOKS_AT = 0.2  # share of a frame that the other map must show for the frame to be compared
+_LOOKS_AT = 0.2  # share of a frame that must fit the other map for the frame to be compared
 _FAR_M = 10.0
 LEAST_OVERLAP = 0.05  # share of the pixels with a reading that must fit the other map
 LEAST_CONSISTENT = 0.85  # share of those that fit among those that fit or contradict
 LEAST_ALIKE = 0.5
-"""Correlation of the images' fine structure with the other map's view.
+"""Least correlation of the images' fine structure with the other map's view.
 
-The median over the frames that look at it.
+The median over the frames that overlap it.
 """
 
 
 @dataclass(frozen=True)
 class FitConfig(Checked):
-    """When two maps that lie so are taken to show the same place.
+    """Parameters of the check whether two maps show the same place.
 
     Attributes:
-        queries: frames of each map that are laid upon the other.
-        tolerance_m: depth differs from the other map where it differs by more than this.
+        queries: number of frames of each map compared with the other.
+        tolerance_m: largest depth difference of a reading that fits the other map.
     """
 
     queries: int = bounded(24, 1, 10_000)
@@ -41,44 +41,44 @@ class FitConfig(Checked):
 
 
 class MapRenderer(Protocol):
-    """What can render a map."""
+    """Renders a map."""
 
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
-        """Views of the map from ``poses`` (N, 4, 4)."""
+        """Render the map from ``poses`` (N, 4, 4)."""
 
 
 class SeenMap(Protocol):
-    """A map, and N frames of what it shows."""
+    """A map, and the N frames it was built from."""
 
     @property
     def backend(self) -> MapRenderer:
-        """What holds the map."""
+        """The renderer of the map."""
 
     @property
     def frames(self) -> Sequence[RGBDFrame]:
-        """N."""
+        """The N frames."""
 
     @property
     def estimates(self) -> Float64:
-        """(N, 4, 4) T_map_camera."""
+        """Their estimated poses (N, 4, 4) T_map_camera."""
 
     @property
     def tracked(self) -> NDArray[np.bool_]:
-        """(N,) which of them are part of the map."""
+        """Which frames (N,) are part of the map."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How what either robot saw fits the map of the other."""
+    """How well each map's frames fit the other map."""
 
     overlap: float = float("nan")  # share of the pixels with a reading that fit
     consistent: float = float("nan")  # share of those among the pixels that fit or contradict
-    # correlation with the other map's view, median over the frames that look at it.
+    # correlation with the other map's view, median over the frames that overlap it.
     alike: float = float("nan")
 
 
 def why_not_believed(fit: Fit) -> str:
-    """Why maps that fit so are not taken to show the same place; empty if they are."""
+    """Why the fit does not show the same place; empty if it does."""
     if fit.overlap < LEAST_OVERLAP:
         return "the maps hardly overlap there"
     if fit.consistent < LEAST_CONSISTENT:
@@ -89,11 +89,11 @@ def why_not_believed(fit: Fit) -> str:
 
 
 def measure_fit(a: SeenMap, b: SeenMap, T_a_b: Float64, config: FitConfig) -> Fit:
-    """Lay the frames of both maps upon the view that the other predicts there.
+    """Compare the frames of each map with the view that the other predicts at their poses.
 
-    A surface of the map behind the reading may be one that only the map's camera saw, and says
-    nothing. One in front of the reading contradicts it: the ray went through it. Frames that do not
-    look at the other map at all say nothing either.
+    A map surface behind a reading is no evidence: perhaps only the map's camera saw it. One in
+    front of the reading contradicts it, because the ray passed through. Frames that do not overlap
+    the other map are no evidence either.
     """
     fits, contradictions, readings = 0, 0, 0
     alike: list[float] = []

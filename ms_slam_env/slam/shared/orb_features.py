@@ -14,11 +14,11 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.shared.rows import Rows
 
 SCALE = 1.2  # between levels of the pyramid, as in ORB-SLAM
-_EDGE_PX = 8  # of the magnified image; ORB itself continues the image by reflection
-_CANDIDATES = 2  # corners found per corner kept
-_CELLS = (8, 6)  # across and down, in which corners are kept in equal numbers
+_EDGE_PX = 8  # margin of the magnified image; ORB itself extends the image by reflection
+_CANDIDATES = 2  # corners detected per corner kept
+_CELLS = (8, 6)  # grid across and down; each cell keeps the same number of corners
 _SLOPE_PX = 2.0  # half the distance over which a slope is measured
-_EDGE_PER_M = 0.03  # a step of inverse depth between neighbours that is an edge, 1/m
+_EDGE_PER_M = 0.03  # step of inverse depth between neighbours that marks an edge, 1/m
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Features(Rows):
     pixels: Float64  # (N, 2) float64 positions (u, v)
     inverse_depth: Float64  # (N,) float64, 1/m; 0 = not known
     descriptors: NDArray[np.uint64]  # (N, 4) uint64, the 256 bits of ORB
-    # (N,) float64 error of the position, in units of that of a corner of the full image: pixels of
-    # the image along a pixel of the level that it was found on.
+    # (N,) float64 relative error of the position, 1 for a corner of the full image: size of a pixel
+    # of the pyramid level it was found on, in pixels of the image.
     scale: Float64
 
     def points(self, intrinsics: Intrinsics) -> Float64:
@@ -41,14 +41,14 @@ class Features(Rows):
 
 _FAST_THRESHOLD = 7  # least contrast of a corner, grey levels
 _DETECTION_WIDTH = 320
-"""Smaller images are magnified to this width before features are sought.
+"""Smaller images are magnified to this width before detection.
 
-ORB describes a patch of 31 pixels, a fifth of an image of 160.
+ORB describes a patch of 31 pixels, a fifth of an image 160 pixels wide.
 """
 
 
 class FeatureExtractor:
-    """Finds and describes corners evenly over the image; for the options see ``SparseConfig``."""
+    """Detects and describes corners evenly over the image; for options see ``SparseConfig``."""
 
     def __init__(self, intrinsics: Intrinsics, features: int = 600, levels: int = 4) -> None:
         self._count = features
@@ -63,7 +63,7 @@ class FeatureExtractor:
         )
 
     def __call__(self, grey: NDArray[np.uint8], inverse_depth: InverseDepth) -> Features:
-        """Features of an image (H, W) uint8 with its inverse depth."""
+        """Extract the features of an image (H, W) uint8 with its inverse depth."""
         n = self._magnify
         size = (n * grey.shape[1], n * grey.shape[0])
         image = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC) if n > 1 else grey
@@ -84,7 +84,7 @@ class FeatureExtractor:
         )
 
     def _spread(self, corners: Sequence[cv2.KeyPoint]) -> Sequence[cv2.KeyPoint]:
-        """The strongest corners of every cell of the image, ``features`` in all."""
+        """Select the strongest corners of every cell of the image, ``features`` in all."""
         if len(corners) <= self._count:
             return corners
         across, down = _CELLS
@@ -101,9 +101,9 @@ class FeatureExtractor:
 
 
 class InverseDepth:
-    """The inverse depth of an image, smoothed over 3x3 pixels, for points between pixels.
+    """Inverse depth of an image, smoothed over 3x3 pixels, with subpixel lookup.
 
-    The inverse depth of a plane is linear in the image, so the mean is that of the centre.
+    The inverse depth of a plane is linear in the image, so the mean equals the centre's value.
 
     Args:
         depth: (H, W) float32 metres; 0 = no reading.

@@ -1,4 +1,4 @@
-"""The pose of a frame from points of the map and where it sees them."""
+"""Camera poses from map points and their observed positions in the image."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from ms_slam_env.slam.shared.rows import Rows
 
 # 95 % quantiles of the chi-squared distribution with two and three degrees of freedom.
 CHI2_PIXEL, CHI2_PIXEL_AND_DEPTH = 5.991, 7.815
-_ITERATIONS = 4  # a round; outliers are told anew between rounds
+_ITERATIONS = 4  # per round; outliers are reclassified between rounds
 _SMALL_STEP = 1e-4  # metres and radians
 _LEAST_DEPTH_M = 0.05
-_FEWEST = 6  # sightings that a pose can be found from
+_FEWEST = 6  # least number of sightings for a pose
 _DAMPING = 1e-9 * np.eye(6)
 _RANSAC_ITERATIONS = 200
 
 
 @dataclass(frozen=True)
 class Sightings(Rows):
-    """Where an image shows points."""
+    """Observed positions of points in an image."""
 
     pixels: Float64  # (N, 2) measured positions
     inverse_depth: Float64  # (N,) measured, 1/m; 0 = not known
@@ -38,15 +38,15 @@ def residuals(
 ) -> tuple[Float64, Float64]:
     """Residuals (N, 3) of u, v and inverse depth in standard deviations, and points (N, 3).
 
-    The points are in the camera frame; one behind the camera has infinite residuals. Where the
-    depth was not measured its residual is 0.
+    The returned points are in the camera frame; one behind the camera has infinite residuals. An
+    unmeasured depth has residual 0.
     """
     p = transform_points(T_camera_world, points)
     return weighted_residuals(p, seen, intrinsics), p
 
 
 def weighted_residuals(p: Float64, seen: Sightings, intrinsics: Intrinsics) -> Float64:
-    """Residuals (N, 3) of points ``p`` (N, 3) of the camera frame; see ``residuals``."""
+    """Residuals (N, 3) of points ``p`` (N, 3) in the camera frame; see ``residuals``."""
     z = np.maximum(p[:, 2], _LEAST_DEPTH_M)
     r = np.empty((len(p), 3))
     r[:, 0] = (intrinsics.fx * p[:, 0] / z + intrinsics.cx - seen.pixels[:, 0]) / seen.sigma_px
@@ -77,18 +77,18 @@ def refine_pose(
     intrinsics: Intrinsics,
     rounds: int = 3,
 ) -> tuple[Float64, NDArray[np.bool_]]:
-    """Pose that explains the sightings best, and which of them (N,) it explains.
+    """Find the pose that best explains the sightings, and which of them (N,) it explains.
 
-    Gauss-Newton with Huber's weights, and outliers left out by the 95 % quantile of chi-squared
-    between rounds, as in ORB-SLAM2 (Mur-Artal and Tardos, TRO 2017, section III-C), here with the
-    inverse depth as third measurement.
+    Gauss-Newton with Huber weights; between rounds outliers are removed by the 95 % quantile of
+    chi-squared, as in ORB-SLAM2 (Mur-Artal and Tardos, TRO 2017, section III-C). Here the third
+    measurement is inverse depth.
 
     Args:
-        T_world_camera: (4, 4) where to start.
+        T_world_camera: (4, 4) initial pose.
         points: (N, 3) world frame.
-        seen: where the frame shows them.
-        intrinsics: of the frame.
-        rounds: of iterations.
+        seen: their observations in the frame.
+        intrinsics: intrinsics of the frame.
+        rounds: rounds of iterations.
     """
     limit = np.where(seen.inverse_depth > 0, CHI2_PIXEL_AND_DEPTH, CHI2_PIXEL)
     T = invert(T_world_camera)
@@ -107,7 +107,7 @@ def refine_pose(
 def _gauss_newton(
     T: Float64, points: Float64, seen: Sightings, limit: Float64, intrinsics: Intrinsics
 ) -> Float64:
-    """T_camera_world (4, 4) after a few steps from ``T``."""
+    """Refine ``T`` in a few steps; return T_camera_world (4, 4)."""
     J = np.empty((len(points), 3, 6))
     for _ in range(_ITERATIONS):
         r, p = residuals(T, points, seen, intrinsics)
@@ -133,9 +133,9 @@ def _gauss_newton(
 def pose_from_matches(
     points: Float64, pixels: Float64, intrinsics: Intrinsics, error_px: float
 ) -> tuple[Float64, NDArray[np.bool_]] | None:
-    """Pose (4, 4) T_points_camera by PnP and RANSAC, and its inliers (N,); None if there is none.
+    """Estimate T_points_camera (4, 4) and its inliers (N,) by PnP and RANSAC; None on failure.
 
-    OpenCV's RANSAC starts from the same random number in every call.
+    Deterministic: OpenCV's RANSAC uses the same random seed in every call.
     """
     if len(points) < 6:
         return None

@@ -1,4 +1,4 @@
-"""Dataclasses of arrays that have one row for each of N things."""
+"""Dataclasses of arrays with one row per item."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ R = TypeVar("R", bound="Rows")
 
 
 class Rows:
-    """A dataclass of arrays (N, ...); a field that is a number belongs to all rows."""
+    """A dataclass of arrays (N, ...); a scalar field applies to all rows."""
 
     def __len__(self) -> int:
         return len(getattr(self, fields(self)[0].name))  # type: ignore[arg-type]
 
     def chosen(self: R, which: Any) -> R:
-        """Some of the rows, as indices, a mask or a slice say."""
+        """Select rows by indices, a mask or a slice."""
         values = [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
         return type(self)(*(v[which] if isinstance(v, np.ndarray) else v for v in values))
 
 
 def join(parts: Sequence[R]) -> R:
-    """The rows of several, one after the other; all fields must be arrays."""
+    """Concatenate the rows of several; all fields must be arrays."""
     kind = type(parts[0])
     names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
     return kind(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

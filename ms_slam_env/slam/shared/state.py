@@ -1,4 +1,4 @@
-"""Objects that go on bit-exactly from a state that they gave."""
+"""Objects whose state can be saved and restored bit-exactly."""
 
 from __future__ import annotations
 
@@ -11,37 +11,36 @@ from ms_slam_env.errors import InputError
 
 
 class Stateful(ABC):
-    """What can be saved and restored."""
+    """An object that can be saved and restored."""
 
     @abstractmethod
     def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays and plain values."""
+        """Return everything needed to continue bit-exactly, as NumPy arrays and plain values."""
 
     @abstractmethod
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` of an object made in the same way returned."""
+        """Restore a state that ``get_state`` of an identically constructed object returned."""
 
     def state_like(self) -> Any:
-        """What ``state_check`` compares states with; the object is as it was made, or reset.
+        """The template that ``state_check`` compares states with, from a fresh or reset object.
 
-        A fresh state, but where that is no example of others.
+        A fresh state, except where later states look different.
         """
         return self.get_state()
 
 
 class Saved(Stateful):
-    """An object whose state is the values of the attributes that ``saved`` names.
+    """An object whose state consists of the attributes named in ``saved``.
 
-    Arrays, plain values and lists of them are copied. What is ``Stateful``, or a list of such,
-    gives its own state and takes it back. ``also_saved`` names what a subclass adds to the state by
-    itself.
+    Arrays, plain values and lists of them are copied. A ``Stateful`` attribute, or a list of them,
+    saves and restores itself. ``also_saved`` names what a subclass adds to the state itself.
     """
 
     saved: ClassVar[tuple[str, ...]] = ()
     also_saved: ClassVar[tuple[str, ...]] = ()
 
     def get_state(self) -> dict[str, Any]:
-        """Copies of the attributes, by their names without a leading underscore."""
+        """Copy the attributes, by their names without a leading underscore."""
         return {_key(name): _state_of(getattr(self, name)) for name in self.saved}
 
     def state_like(self) -> Any:
@@ -49,10 +48,10 @@ class Saved(Stateful):
         return {_key(name): _like_of(getattr(self, name)) for name in self.saved}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Take the attributes from a state.
+        """Restore the attributes from a state.
 
         Raises:
-            InputError: the state lacks some, as that of something else does; nothing has changed.
+            InputError: the state lacks some, so it belongs to something else; nothing has changed.
         """
         check_has(state, (*map(_key, self.saved), *self.also_saved), type(self).__name__)
         for name in self.saved:
@@ -60,10 +59,10 @@ class Saved(Stateful):
 
 
 def check_has(state: Any, names: Iterable[str], kind: str) -> None:
-    """Refuse as a state of a ``kind`` what lacks one of ``names``.
+    """Refuse a state that lacks one of ``names``.
 
     Raises:
-        InputError: naming the kind and what is missing.
+        InputError: it names the ``kind`` of object and what is missing.
     """
     if not isinstance(state, Mapping):
         raise InputError(f"a {type(state).__name__} is not a saved state of {kind}")

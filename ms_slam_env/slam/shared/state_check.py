@@ -1,8 +1,8 @@
-"""Whether a state may be gone on from: what it holds, of which type, shape and size.
+"""Validates a saved state before it is restored: content, types, shapes and sizes.
 
-A state is compared with what ``Stateful.state_like`` says of it: with a fresh state, in which
-`ArrayOf`, `ListOf`, `WholeNumber`, `OrNone` and `Fields` stand where a fresh one is no example, and
-say how lengths and indices hang together.
+A state is compared with the template of ``Stateful.state_like``: a fresh state in which `ArrayOf`,
+`ListOf`, `WholeNumber`, `OrNone` and `Fields` replace values that vary, and relate lengths to
+indices.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from numpy.typing import NDArray
 from ms_slam_env.errors import InputError
 
 _IDENTITY = np.eye(3)
-_RIGID = 1e-4  # as ``check_pose`` has it
+_RIGID = 1e-4  # as in ``check_pose``
 _KINDS: tuple[Any, ...] = ((bool, np.bool_), numbers.Integral, (float, np.floating), str, tuple)
-_SUM_ERROR = 1e-6  # of a distribution
+_SUM_ERROR = 1e-6  # tolerance of a distribution's sum
 MOST = 2**30
-"""Largest number of anything that is counted: no count to come overflows 32 bits."""
+"""Largest count in a state, so that no later count overflows 32 bits."""
 _MOST_FLOAT32 = 1e15  # kernels square them and add them up
 _MOST_SEED = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class WholeNumber:
-    """A whole number of a state.
+    """A whole number in a state.
 
     Attributes:
         least: smallest.
         most: largest, or the name of a length that is.
-        index_of: name of a length that it must be below; of none, too, 0 says the first.
+        index_of: name of a length that it must be below; 0 is valid even if that length is 0.
     """
 
     least: int = 0
@@ -43,12 +43,12 @@ class WholeNumber:
 
 
 SEED = WholeNumber(most=_MOST_SEED)
-"""Of noise, or of a scene."""
+"""Seed of noise or of a scene."""
 
 
 @dataclass(frozen=True)
 class Real:
-    """A number of a state between ``least`` and ``most``, which may be infinite."""
+    """A number in a state between ``least`` and ``most``, which may be infinite."""
 
     least: float = -np.inf
     most: float = np.inf
@@ -56,17 +56,17 @@ class Real:
 
 @dataclass(frozen=True)
 class ArrayOf:
-    """An array of a state.
+    """An array in a state.
 
     Attributes:
-        dtype: of its elements.
-        shape: a name stands for one length, wherever it occurs in a state, or in one mapping or
-            list of a list in it.
-        least: smallest element; None: whatever is finite.
-        most: largest, where there is a smallest.
+        dtype: type of its elements.
+        shape: lengths of its axes. A name stands for the same length throughout the state, or
+            within one element of a list.
+        least: smallest element; None: any finite value.
+        most: largest element; used only with ``least``.
         index_of: name of a length that all elements must be below.
-        may_be_nan: whether NaN means none.
-        is_distribution: whether it adds up to 1 along the last axis.
+        may_be_nan: whether NaN is allowed and means "none".
+        is_distribution: whether it sums to 1 along the last axis.
     """
 
     dtype: Any
@@ -80,12 +80,12 @@ class ArrayOf:
 
 @dataclass(frozen=True)
 class ListOf:
-    """A list of a state, of things that look alike.
+    """A list in a state whose elements match one template.
 
     Attributes:
-        of: what they look like.
-        length: its name, or the largest.
-        rising: key of mappings, a whole number that is larger from one to the next.
+        of: template of the elements.
+        length: name of its length, or its largest length.
+        rising: key of a whole number in each mapping that must increase along the list.
     """
 
     of: Any
@@ -95,14 +95,14 @@ class ListOf:
 
 @dataclass(frozen=True)
 class OrNone:
-    """None, or something that looks like ``of``."""
+    """None, or a value that matches ``of``."""
 
     of: Any
 
 
 @dataclass(frozen=True)
 class Fields:
-    """A mapping of a state with a rule of its own, which says what is wrong, or nothing."""
+    """A mapping in a state with an additional rule, which returns what is wrong or ""."""
 
     of: Mapping[str, Any]
     rule: Callable[[Any], str]
@@ -110,37 +110,37 @@ class Fields:
 
 @dataclass(frozen=True)
 class Depending:
-    """What ``of`` makes of the value that is to be compared."""
+    """A template that ``of`` computes from the value to be checked."""
 
     of: Callable[[Any], Any]
 
 
 @dataclass
 class _Lengths:
-    """Lengths by name, and what is to be checked once all are known."""
+    """Named lengths, and checks to run once all are known."""
 
     outer: _Lengths | None = None
     own: dict[str, int] = field(default_factory=dict)
     later: list[Callable[[], None]] = field(default_factory=list)
 
     def inside(self) -> _Lengths:
-        """Those of one element of a list."""
+        """Open a scope for one element of a list."""
         return _Lengths(self, later=self.later)
 
     def fix(self, length: int | str, found: int, where: str) -> None:
-        """Refuse another length than the one of that name, or than the number."""
+        """Refuse a length that differs from the named one or from the given number."""
         wanted = self.own.setdefault(length, found) if isinstance(length, str) else length
         if found != wanted:
             raise wrong(where, f"has length {found} in place of {wanted}")
 
     def get(self, name: str) -> int | None:
-        """The length of that name, if anything has it."""
+        """The named length, or None if it is not known."""
         if name in self.own:
             return self.own[name]
         return self.outer.get(name) if self.outer else None
 
     def most(self, like: WholeNumber | ArrayOf) -> float:
-        """The largest number that there may be."""
+        """The largest value that ``like`` allows."""
         if like.index_of:
             count = self.get(like.index_of)
             least = 0 if isinstance(like, WholeNumber) else -1
@@ -152,14 +152,15 @@ class _Lengths:
 
 
 def check_like(value: Any, like: Any, where: str, lengths: Mapping[str, int] | None = None) -> None:
-    """Refuse a part of a state that is not made like a part of the same environment.
+    """Refuse a part of a state that does not match the template ``like``.
 
-    Where ``like`` is an empty table, list or None there may be more of it; where an array of it
-    holds NaN, meaning none, ``value`` may as well. Counts are not negative, numbers are finite,
-    poses are rigid motions. ``lengths`` are known by name before anything is looked at.
+    Where ``like`` is an empty table, an empty list or None, ``value`` may hold more; where an array
+    in ``like`` holds NaN, meaning "none", so may ``value``. Counts must not be negative, numbers
+    must be finite, and poses must be rigid motions. ``lengths`` are the named lengths known in
+    advance.
 
     Raises:
-        InputError: naming the place in the state and what is wrong with it.
+        InputError: it names the place in the state and what is wrong with it.
     """
     known = _Lengths(own=dict(lengths or {}))
     _check(value, like, where, known)
@@ -178,7 +179,7 @@ def _check(value: Any, like: Any, where: str, lengths: _Lengths) -> None:
         check_plain(value, 0, where, low=like.least)
         lengths.later.append(lambda: _check_between(value, like.least, lengths.most(like), where))
     elif isinstance(like, numbers.Integral) and not isinstance(like, bool):
-        least = min(0, int(like))  # where there may be none, -1 says so
+        least = min(0, int(like))  # -1 in the template allows -1 for none
         _check(value, WholeNumber(least), where, lengths)
     elif isinstance(like, Real):
         if not isinstance(value, (float, np.floating)) or not like.least <= value <= like.most:
@@ -261,7 +262,7 @@ def _check_rising(value: list[Any], key: str, where: str) -> None:
 
 
 def is_open(like: Any) -> bool:
-    """Whether something in ``like`` may be replaced by what ``check_like`` knows nothing of."""
+    """Whether ``like`` has parts whose content ``check_like`` cannot know."""
     if isinstance(like, (Fields, OrNone, ListOf)):
         return is_open(like.of)
     if isinstance(like, Mapping):
@@ -272,18 +273,18 @@ def is_open(like: Any) -> bool:
 
 
 def wrong(where: str, what: str) -> InputError:
-    """Return the error that says what is wrong at a place in a state."""
+    """Make the error for a place in a state."""
     return InputError(f"not a saved state: {where} {what}")
 
 
 def check_mapping(value: Any, where: str) -> None:
-    """Refuse what is no mapping."""
+    """Refuse anything but a mapping."""
     if not isinstance(value, Mapping):
         raise wrong(where, f"is a {type(value).__name__}, not a mapping")
 
 
 def check_keys(value: Mapping[Any, Any], names: Sequence[str], where: str) -> None:
-    """Refuse a mapping of other keys than ``names``."""
+    """Refuse a mapping whose keys are not ``names``."""
     if set(value) != set(names):
         missing = [name for name in names if name not in value]
         more = sorted(str(name) for name in set(value) - set(names))
@@ -293,7 +294,7 @@ def check_keys(value: Mapping[Any, Any], names: Sequence[str], where: str) -> No
 def check_list(
     value: Any, where: str, length: int | None = None, kind: type[Sequence[Any]] = list
 ) -> None:
-    """Refuse what is no list, or not of that length."""
+    """Refuse anything but a list, of that ``length`` if given."""
     if not isinstance(value, kind):
         raise wrong(where, f"is a {type(value).__name__}, not a {kind.__name__}")
     if length is not None and len(value) != length:
@@ -311,7 +312,7 @@ def _check_fields(value: Any, like: Mapping[str, Any], where: str, lengths: _Len
 
 
 def _check_random(value: Mapping[str, Any], like: Mapping[str, Any], where: str) -> None:
-    """The state of a random number generator is one that a generator of its kind takes."""
+    """Refuse a random generator's state that a generator of its kind does not accept."""
     generator = getattr(np.random, str(like["bit_generator"]))(0)
     try:
         generator.state = value
@@ -329,7 +330,7 @@ def _is_same(a: Any, b: Any) -> bool:
 
 
 def check_array(value: Any, like: NDArray[Any], where: str) -> None:
-    """Refuse what is no array of the same type and shape; the first axis may grow from nothing."""
+    """Refuse anything but an array of the same type and shape; an empty first axis may grow."""
     _check_form(value, like.dtype, like.ndim, where)
     grows = like.ndim > 0 and len(like) == 0
     rest = slice(int(grows), None)
@@ -348,10 +349,10 @@ def _check_form(value: Any, dtype: Any, ndim: int, where: str) -> None:
 
 
 def stacked(arrays: list[Any], where: str) -> NDArray[Any]:
-    """Arrays of one shape and type as one array.
+    """Stack arrays of one shape and type.
 
     Raises:
-        InputError: they are none; naming the place in the state.
+        InputError: they differ in shape or type; the message names the place in the state.
     """
     if not all(isinstance(array, np.ndarray) for array in arrays):
         raise wrong(where, "holds something else than arrays")
@@ -361,10 +362,10 @@ def stacked(arrays: list[Any], where: str) -> NDArray[Any]:
 
 
 def check_values(value: NDArray[Any], where: str, may_be_nan: bool = False) -> None:
-    """Refuse numbers that are not finite, and (..., 4, 4) that are no rigid motions.
+    """Refuse numbers that are not finite, and arrays (..., 4, 4) that are not rigid motions.
 
     Raises:
-        InputError: naming the place in the state.
+        InputError: it names the place in the state.
     """
     if value.dtype.names:
         for name in value.dtype.names:
@@ -382,7 +383,7 @@ def check_values(value: NDArray[Any], where: str, may_be_nan: bool = False) -> N
 
 def _is_finite(value: NDArray[Any]) -> bool:
     flat = value.reshape(-1)
-    # The sum of squares, a fifth of the time, is finite unless a value is not, or very large.
+    # The sum of squares takes a fifth of the time; it is finite unless a value is not or is huge.
     with np.errstate(over="ignore", invalid="ignore"):
         if np.isfinite(np.dot(flat, flat)):
             return True
@@ -407,7 +408,7 @@ def check_plain(value: Any, like: Any, where: str, low: int | None = None) -> No
     if not isinstance(value, kind) or (kind is not _KINDS[0] and isinstance(value, _KINDS[0])):
         raise wrong(where, f"is a {type(value).__name__}, not a {type(like).__name__}")
     if kind is numbers.Integral:
-        low = min(0, like) if low is None else low  # where there may be none, -1 says so
+        low = min(0, like) if low is None else low  # -1 in the template allows -1 for none
         if not low <= value <= _MOST_SEED:
             raise wrong(where, f"is {value}, outside [{low}, {_MOST_SEED}]")
     if kind is _KINDS[2] and not np.isfinite(value):
@@ -415,7 +416,7 @@ def check_plain(value: Any, like: Any, where: str, low: int | None = None) -> No
 
 
 def _check_free(value: Any, where: str) -> None:
-    """What a part that is still empty has no example of: plain values and arrays of numbers."""
+    """Check a part whose template is empty: plain values and arrays of numbers only."""
     if isinstance(value, np.ndarray):
         check_values(value, where)
     elif isinstance(value, Mapping):

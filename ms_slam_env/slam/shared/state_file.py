@@ -1,7 +1,7 @@
 """States on disk: arrays in an NPZ file, everything else as JSON beside them; nothing is executed.
 
-A state is nested mappings, lists and tuples of arrays and plain values. Its arrays stand in the
-archive under numbers; ``tree.json`` says where each belongs.
+A state is nested mappings, lists and tuples of arrays and plain values. Its arrays are numbered in
+the archive; ``tree.json`` says where each belongs.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from ms_slam_env.errors import InputError
 
 FORMAT, VERSION = "ms_slam_env map", 1
 MAX_TREE_BYTES = 16 * 1024 * 1024
-"""Of the JSON text: a hundred thousand frames with four arrays each need half of it."""
+"""Size limit of the JSON text: a hundred thousand frames with four arrays each need half of it."""
 MAX_EXPANSION, ALWAYS_TAKEN_BYTES = 20, 32 * 1024 * 1024
-"""Times that a larger file may grow once unpacked: maps as they are written do not, zeros that
-somebody packed grow to 1000 times."""
+"""How many times a file may grow when unpacked, and the size always accepted. Real maps stay below;
+packed zeros grow 1000 times."""
 _PIECE_BYTES = 1024 * 1024
 _TREE = "tree.json"
 _CONTAINERS = {"list": list, "tuple": tuple}
@@ -38,20 +38,20 @@ _BROKEN = (
     *(NotImplementedError, RecursionError, MemoryError, OverflowError, RuntimeError),
     *(zipfile.BadZipFile, zlib.error, tokenize.TokenError, SyntaxError),  # headers are Python
 )
-"""Whatever the readers of zip archives, of JSON and of arrays raise at what is none."""
+"""Errors that the readers of zip archives, JSON and arrays raise on invalid data."""
 
 
 def write_state(path: Path, about: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-    """Write a state, whole or not at all.
+    """Write a state atomically.
 
     Args:
-        path: of the file.
-        about: what the state is of, in JSON's types.
+        path: path of the file.
+        about: description of the state's owner, in JSON types.
         state: as ``Stateful.get_state`` returns it.
 
     Raises:
-        InputError: as `check_packable`.
-        OSError: nothing can be written there.
+        InputError: as in `check_packable`.
+        OSError: the file cannot be written.
     """
     header, arrays = _header(about, state)
     data = io.BytesIO()
@@ -64,16 +64,16 @@ def write_state(path: Path, about: Mapping[str, Any], state: Mapping[str, Any]) 
 
 
 def check_packable(about: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-    """Refuse what `write_state` cannot write, or would be read back as something else.
+    """Refuse a state that `write_state` cannot write, or that would be read back differently.
 
     Raises:
-        InputError: naming the place and what may stand there.
+        InputError: the message names the place and the types that a file can hold.
     """
     _header(about, state)
 
 
 def _header(about: Mapping[str, Any], state: Mapping[str, Any]) -> tuple[str, list[NDArray[Any]]]:
-    """``tree.json`` as text, and the arrays beside it."""
+    """Text of ``tree.json``, and the arrays stored next to it."""
     arrays: list[NDArray[Any]] = []
     tree = _packed(state, arrays, "state")
     header = {"format": FORMAT, "version": VERSION, "about": about, "state": tree}
@@ -87,10 +87,10 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read what `write_state` wrote.
 
     Returns:
-        What the state is of, and the state.
+        The description ``about``, and the state.
 
     Raises:
-        InputError: no such file, none of these, of another version, or damaged; one line.
+        InputError: no such file, not a state file, another version, or damaged; one line.
     """
     with _opened(path) as (archive, header):
         read: set[str] = set()
@@ -99,14 +99,14 @@ def read_state(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def read_about(path: Path) -> dict[str, Any]:
-    """What the state in a file is of; see `read_state`."""
+    """Read only the description of a state file; see `read_state`."""
     with _opened(path) as (_, header):
         return dict(header["about"])
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, Mapping[str, Any]]]:
-    """The archive and its header; whatever goes wrong with either is one error."""
+    """Open the archive and read its header; any failure becomes one InputError."""
     check_file(path, "map", MAX_MESH_BYTES)
     try:
         with zipfile.ZipFile(path) as archive:
@@ -124,10 +124,10 @@ def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, Mapping[str, Any]]]:
 
 
 def check_expansion(archive: zipfile.ZipFile, packed_bytes: int) -> None:
-    """Refuse an archive of so many bytes that grows too much, before anything in it is read.
+    """Refuse an archive that would grow too much when unpacked, before reading its content.
 
     Raises:
-        InputError: saying how much is taken.
+        InputError: it names the limit.
     """
     most = max(MAX_EXPANSION * packed_bytes, ALWAYS_TAKEN_BYTES)
     if sum(info.file_size for info in archive.infolist()) > most:
@@ -146,7 +146,11 @@ def _name(index: int) -> str:
 
 
 def _packed(value: Any, arrays: list[NDArray[Any]], where: str) -> Any:
-    """``value`` in JSON's types; its arrays, and numbers of NumPy, are added to ``arrays``."""
+    """Convert ``value`` to JSON types; arrays and NumPy numbers move to ``arrays``.
+
+    Raises:
+        InputError: a file cannot hold the value; the message says ``where`` it is.
+    """
     if isinstance(value, (np.ndarray, np.generic)):
         if value.dtype.hasobject:
             raise _unpackable(where, "an array of objects")
@@ -189,7 +193,7 @@ def _unpacked(tree: Any, array: Callable[[int], NDArray[Any]]) -> Any:
 
 
 def _read_array(archive: zipfile.ZipFile, index: int, read: set[str]) -> NDArray[Any]:
-    """One array, whose header must say how long it really is; none that was ``read`` before."""
+    """Read one array; its header must match its real length, and no array may be ``read`` twice."""
     name = _name(index)
     if name in read:
         raise ValueError(f"{name} stands for several arrays")

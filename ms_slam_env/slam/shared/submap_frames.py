@@ -1,10 +1,10 @@
-"""Which frames belong to which submap, where the submaps lie, and how sure that is.
+"""Tracks which frames belong to which submap, where submaps lie, and how certain that is.
 
 A SLAM that has lost its map starts a new one (the Atlas of Elvira, Tardós and Montiel, IROS 2019).
-Submap 0 starts with the run and defines the world. A later one lies where the camera was best
-guessed to be when it started: a link to the submap before it, with a covariance. When the camera
-sees an older submap again, the newer of the two is moved onto it and both go on as one, under the
-number of the older.
+Submap 0 starts with the run and defines the world. A later one is placed at the best guess of the
+camera's pose when it started: a link to the submap before it, with a covariance. When the camera
+sees an older submap again, the newer of the two is moved onto it, and both continue as one under
+the older's number.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from ms_slam_env.slam.shared.state_check import ListOf, WholeNumber
 
 @dataclass(frozen=True)
 class Submaps:
-    """The K submaps of a run, as they hang together now."""
+    """The K submaps of a run and how they are joined now."""
 
     first_frames: Int32  # (K,) frame, counted since ``reset``, that started each
-    # (K,) the oldest submap that each is joined to: itself where it is joined to none.
+    # (K,) the oldest submap that each is joined to; itself if it is not joined.
     joined_to: Int32
-    joined_at: Int32  # (K,) frame at which it was joined to an older one; -1: it was not
+    joined_at: Int32  # (K,) frame at which it was joined to an older one; -1 if it was not
     # (K, 6, 6) of the twist (rho, phi) in metres and radians, with the true pose of the first
     # camera T exp(twist), relative to the submap before; 0 for the first.
     links: Float64
@@ -37,7 +37,7 @@ class Submaps:
 
 
 def one_submap() -> Submaps:
-    """What there is where tracking never was lost for long."""
+    """The submaps of a run that never lost tracking for long: only the first."""
     one = np.zeros(1, dtype=np.int32)
     return Submaps(one, one.copy(), np.full(1, -1, dtype=np.int32), np.zeros((1, 6, 6)))
 
@@ -47,7 +47,7 @@ _OF_SUBMAPS = ("first_frames", "joined_to", "joined_at", "links", "starts")
 
 @dataclass
 class SubmapLedger(Saved):
-    """Submaps of one camera and the path through those after the first; empty until then."""
+    """Submaps of one camera, and the trajectory since the second started."""
 
     first_frames: list[int] = field(default_factory=lambda: [0])
     joined_to: list[int] = field(default_factory=lambda: [0])
@@ -67,7 +67,7 @@ class SubmapLedger(Saved):
         return len(self.first_frames) > 1
 
     def start(self, frame: int, pose: Float64, link: Float64) -> int:
-        """Number of a new submap that a frame at ``pose`` (4, 4) starts."""
+        """Start a submap at a frame with ``pose`` (4, 4); return its number."""
         number = len(self.first_frames)
         self.first_frames.append(frame)
         self.joined_to.append(number)
@@ -77,22 +77,22 @@ class SubmapLedger(Saved):
         return number
 
     def record(self, frame: int, label: int, pose: Float64) -> None:
-        """Take note of a frame that was tracked in submap ``label``."""
+        """Record a frame tracked in submap ``label``."""
         self.frames.append(frame)
         self.labels.append(label)
         self.poses.append(pose.copy())
 
     def correct(self, frames: Int32, poses: Float64) -> None:
-        """Put frames (N,) at other poses (N, 4, 4), those that are not known yet as well."""
+        """Move frames (N,) to new poses (N, 4, 4); frames not recorded are ignored."""
         known = {frame: place for place, frame in enumerate(self.frames)}
         for frame, pose in zip(frames.tolist(), poses, strict=True):
             if frame in known:
                 self.poses[known[frame]] = pose.copy()
 
     def covariance(self, number: int, pose: Float64) -> Float64:
-        """Covariance (6, 6) of where a submap lies, of the twist of a camera at ``pose`` in it.
+        """Covariance (6, 6) of a submap's placement, as the twist of a camera at ``pose`` in it.
 
-        The sum over the links back to the last submap that is joined to the first.
+        The sum over the links back to the last submap joined to the first.
         """
         total = np.zeros((6, 6))
         for k in range(number, 0, -1):
@@ -104,7 +104,7 @@ class SubmapLedger(Saved):
         return total
 
     def join(self, older: int, newer: int, correction: Float64, frame: int) -> None:
-        """Move submap ``newer`` by ``correction`` (4, 4) of the world onto ``older``."""
+        """Move submap ``newer`` onto ``older`` by the world-frame ``correction`` (4, 4)."""
         self.move(newer, correction)
         self.joined_at[newer] = frame
         for k, root in enumerate(self.joined_to):
@@ -112,7 +112,7 @@ class SubmapLedger(Saved):
                 self.joined_to[k] = older
 
     def move(self, root: int, correction: Float64) -> None:
-        """Move all that is joined to a submap by ``correction`` (4, 4) of the world."""
+        """Move everything joined to a submap by the world-frame ``correction`` (4, 4)."""
         self.starts = [
             correction @ pose if self.joined_to[k] == root else pose
             for k, pose in enumerate(self.starts)
@@ -123,10 +123,10 @@ class SubmapLedger(Saved):
         ]
 
     def between(self, older: int, newer: int, correction: Float64) -> dict[int, Float64]:
-        """How submaps started between two that are about to be joined move with them.
+        """Motions of the unjoined submaps between two that are about to be joined.
 
-        Each unjoined one by the part of the correction that the links up to it have of the
-        uncertainty of all of them: a link that is sure hardly changes.
+        Each moves by a share of the correction: the uncertainty of the links up to it over that of
+        all links. A certain link hardly changes.
         """
         inner = [k for k in range(older + 1, newer + 1) if self.joined_to[k] in (k, newer)]
         sizes = np.cumsum([np.trace(self.links[k]) for k in inner])
@@ -138,7 +138,7 @@ class SubmapLedger(Saved):
         }
 
     def get_state(self) -> dict[str, Any]:
-        """Everything but the first submap, of which all is known."""
+        """Everything but the first submap, which is always the same."""
         state = super().get_state()
         return state | {name: state[name][1:] for name in _OF_SUBMAPS}
 
@@ -157,7 +157,7 @@ class SubmapLedger(Saved):
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state."""
+        """Restore a state."""
         first = SubmapLedger()
         super().set_state(
             state | {name: getattr(first, name) + state[name] for name in _OF_SUBMAPS}

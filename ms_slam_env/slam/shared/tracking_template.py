@@ -1,4 +1,4 @@
-"""Track, then accept or lose: the skeleton of the backends that process one frame after another."""
+"""Base class of backends that process one frame after another: track, then accept or lose."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
 
 TURN_RAD = np.radians(10.0)
 STEP_M = 0.1
-_TRIALS = 6  # motions that are tried, of all that are compared
-_SAMPLES = 600  # readings that a motion is judged by
+_TRIALS = 6  # motions tried, out of all that are compared
+_SAMPLES = 600  # readings used to score a motion
 
 
 def _signed_axes(size: float) -> Float64:
@@ -48,13 +48,13 @@ MOTIONS = np.stack(
 def motion_hypotheses(
     frame: DepthImage, reference: DepthImage, T_last_camera: Float64, intrinsics: Intrinsics
 ) -> Float64:
-    """Motions T_reference_frame (7, 4, 4) to search from, in the order of trial.
+    """Initial motions T_reference_frame (7, 4, 4), in the order in which they are tried.
 
-    First the last motion ``T_last_camera`` (4, 4), should it go on; then the best of ``MOTIONS``,
-    judged by how well they lay the frame over the reference, in depth and intensity.
+    First the last motion ``T_last_camera`` (4, 4), in case it continues; then the best of
+    ``MOTIONS``, scored by how well they align the frame with the reference in depth and intensity.
     """
-    # What goes on from frame to frame is made rigid: pose times last motion, frame after frame,
-    # multiplies rounding errors of the rotation by 2.4 each time.
+    # Made rigid because it carries over from frame to frame: multiplying pose and last motion
+    # repeatedly amplifies rounding errors of the rotation by 2.4 per frame.
     scores = overlay(frame, reference, MOTIONS, intrinsics, _SAMPLES).scores
     best = np.argsort(-scores, kind="stable")[:_TRIALS]
     return np.concatenate([orthonormal(T_last_camera)[None], MOTIONS[best]])
@@ -69,7 +69,7 @@ class PreparedFrame(Protocol):
 
 
 SEARCHED_FRAMES = 100
-"""So many lost frames in a row are sought at once, then every tenth."""
+"""Lost frames in a row that are all searched for; after that only every tenth is."""
 
 Frame = TypeVar("Frame", bound=PreparedFrame)
 Match = TypeVar("Match")
@@ -80,15 +80,15 @@ class Attempt(Generic[Match]):
     """A pose that a frame may have."""
 
     T_world_camera: Float64  # (4, 4) the pose
-    statistics: AlignmentStatistics  # what it explains of the frame
+    statistics: AlignmentStatistics  # statistics of its alignment
     reason: str  # why it is not accepted; empty if it is
-    match: Match  # what the backend found besides
+    match: Match  # the backend's additional result
 
 
 class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
     """A backend that tries one pose after another, and takes the first that passes its check.
 
-    A subclass says how a frame is prepared, which poses it may have, and how the map grows. While
+    A subclass defines how to prepare a frame, which poses to try, and how the map grows. While
     tracking is lost the pose is held and nothing is fused.
 
     Attributes:
@@ -104,7 +104,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         self.reset()
 
     def _judge_views(self, is_stock: bool) -> None:
-        """Demand ``VIEW_THRESHOLDS`` of an alignment with a view; nothing of a stock one."""
+        """Apply ``VIEW_THRESHOLDS`` to alignments with a view; none for a stock backend."""
         self._thresholds = AcceptanceThresholds() if is_stock else VIEW_THRESHOLDS
         if is_stock:
             self.fewest_readings = 0.0
@@ -114,7 +114,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         pose = np.eye(4) if T_world_camera is None else T_world_camera
         self._pose = np.array(check_pose(pose, "T_world_camera"))
         self._motion = np.eye(4)  # from the frame before to the last one
-        self._lost_frames = 0  # since the last one that was found
+        self._lost_frames = 0  # since the last tracked frame
         self._clear()
 
     def track(self, frame: RGBDFrame, T_world_camera_guess: ArrayLike | None = None) -> TrackResult:
@@ -139,7 +139,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         return self._lose(reason, statistics)
 
     def mark_lost(self) -> None:
-        """Seek the next frame as one after lost tracking; see ``SlamBackend``."""
+        """Treat tracking as lost; see ``SlamBackend``."""
         self._motion = np.eye(4)
         self._lost_frames = self._lost_frames + 1 if self._has_map else 0
 
@@ -150,14 +150,14 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         return self._take(frame, self._prepare(frame))
 
     def _take(self, frame: RGBDFrame, prepared: Frame) -> TrackResult:
-        """Go on from a frame whose pose is known."""
+        """Continue from a frame whose pose is known."""
         self._motion = np.eye(4)
         self._lost_frames = 0
         self._start_from(frame, prepared)
         return TrackResult(self._pose.copy(), True)
 
     def _accept(self, frame: RGBDFrame, prepared: Frame, attempt: Attempt[Match]) -> TrackResult:
-        """Move on to a frame whose pose was found."""
+        """Accept a frame's pose, and extend the map."""
         relocalised, self._lost_frames = self._lost_frames > 0, 0
         before, self._pose = self._pose, attempt.T_world_camera
         self._motion = np.eye(4) if relocalised else invert(before) @ self._pose
@@ -167,7 +167,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         return TrackResult(self._pose.copy(), True, relocalised, *figures, overlap=found.overlap)
 
     def _lose(self, reason: str, statistics: AlignmentStatistics) -> TrackResult:
-        """Hold the pose and the map."""
+        """Keep the pose and the map while tracking is lost."""
         self.mark_lost()
         figures = statistics.inlier_ratio, statistics.residual_m
         return TrackResult(
@@ -176,10 +176,10 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
 
     @property
     def _searches(self) -> bool:
-        """Whether a frame that is not found near the last pose is sought farther away.
+        """Whether to search farther away for a frame not found near the last pose.
 
-        A search costs many times what tracking does. After `SEARCHED_FRAMES` in vain the camera is
-        hardly near, and every tenth frame is enough to notice that it came back.
+        A search costs many times as much as tracking. After `SEARCHED_FRAMES` failures the camera
+        is hardly near, and every tenth frame is enough to notice its return.
         """
         return self._lost_frames < SEARCHED_FRAMES or self._lost_frames % 10 == 0
 
@@ -191,7 +191,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
     @property
     @abstractmethod
     def _no_attempt(self) -> str:
-        """Why tracking failed where there was no pose to try."""
+        """Why tracking failed if there was no pose to try."""
 
     @abstractmethod
     def _clear(self) -> None:
@@ -199,7 +199,7 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
 
     @abstractmethod
     def _prepare(self, frame: RGBDFrame) -> Frame:
-        """The frame as it is tracked."""
+        """Prepare a frame for tracking."""
 
     def _why_no_start(self, prepared: Frame) -> str:
         """Why a first frame with enough readings cannot start the map; empty if it can."""
@@ -211,11 +211,11 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
 
     @abstractmethod
     def _start_from(self, frame: RGBDFrame, prepared: Frame) -> None:
-        """Fuse a frame whose pose is known to be the current one."""
+        """Fuse a frame at the current pose, which is known."""
 
     @abstractmethod
     def _extend(self, frame: RGBDFrame, prepared: Frame, attempt: Attempt[Match]) -> None:
-        """Fuse a frame, if it is worth it, that was found at the current pose."""
+        """Fuse a frame tracked at the current pose, if it adds enough."""
 
     def _miss(self, frame: RGBDFrame, prepared: Frame) -> None:
-        """Take note of a frame that was found nowhere."""
+        """Handle a frame that was not found anywhere."""

@@ -1,4 +1,4 @@
-"""Sparse SLAM: ORB features, local bundle adjustment, a pose graph; depth of keyframes as map."""
+"""Sparse SLAM: ORB features, local bundle adjustment, a pose graph, a map of keyframe depth."""
 
 from ms_slam_env.slam.sparse.sparse_config import SparseConfig
 from ms_slam_env.slam.sparse.sparse_slam import SparseSlam

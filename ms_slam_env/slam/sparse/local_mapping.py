@@ -1,4 +1,4 @@
-"""Local bundle adjustment around a keyframe, through GTSAM."""
+"""Local bundle adjustment around a keyframe, with GTSAM."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from ms_slam_env.slam.shared.point_poses import (
 from ms_slam_env.slam.sparse.sparse_config import INVERSE_DEPTH_NOISE, PIXEL_NOISE
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
-_BASELINE_M = 0.1  # of the imagined second camera; the result does not depend on it
-_FIXED_SIGMA = 1e-6  # of a pose that stays where it is, metres and radians
+_BASELINE_M = 0.1  # of a virtual second camera; does not affect the result
+_FIXED_SIGMA = 1e-6  # of a fixed pose, metres and radians
 _ITERATIONS = 3
-_ERROR_TOLERANCE = 1e-3  # a smaller relative gain ends the iterations
+_ERROR_TOLERANCE = 1e-3  # iterations end at a smaller relative improvement
 _MOST_FIXED = 3  # keyframes beyond the window that hold it in place
 
 
 def load_gtsam() -> Any:
-    """GTSAM's module.
+    """Import GTSAM.
 
     Raises:
         InputError: it is not installed.
@@ -48,7 +48,7 @@ class Bundle:
     """Keyframes, points and sightings."""
 
     poses: Float64  # (K, 4, 4) T_world_camera
-    fixed: NDArray[np.bool_]  # (K,) bool, poses that stay
+    fixed: NDArray[np.bool_]  # (K,) bool, poses that are held fixed
     points: Float64  # (P, 3) world frame
     camera: Int64  # (O,) pose of each sighting
     point: Int64  # (O,) point of each sighting
@@ -56,10 +56,10 @@ class Bundle:
 
 
 def adjust_bundle(bundle: Bundle, intrinsics: Intrinsics) -> tuple[Float64, Float64]:
-    """Poses (K, 4, 4) and points (P, 3) of least squares, with Huber's loss.
+    """Least-squares poses (K, 4, 4) and points (P, 3), with Huber loss.
 
-    Depth enters as the disparity of an imagined second camera, as in ORB-SLAM2 (section III-C);
-    the errors of the two images are correlated so that pixel and inverse depth are independent.
+    Depth enters as the disparity of a virtual second camera, as in ORB-SLAM2 (section III-C); the
+    errors of the two images are correlated so that pixel and inverse depth are independent.
     """
     gtsam = load_gtsam()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -89,7 +89,7 @@ def adjust_bundle(bundle: Bundle, intrinsics: Intrinsics) -> tuple[Float64, Floa
 def _sighting_factors(
     gtsam: Any, bundle: Bundle, intrinsics: Intrinsics, first_point: int
 ) -> list[Any]:
-    """One factor per sighting: with depth that of a stereo camera, without that of one camera."""
+    """One factor per sighting: stereo if its depth is known, otherwise monocular."""
     i = intrinsics
     stereo = gtsam.Cal3_S2Stereo(i.fx, i.fy, 0.0, i.cx, i.cy, _BASELINE_M)
     single = gtsam.Cal3_S2(i.fx, i.fy, 0.0, i.cx, i.cy)
@@ -126,7 +126,7 @@ def _sighting_factors(
 
 
 def _stereo_covariance(sigma_px: float, sigma_disparity: float) -> Float64:
-    """Covariance (3, 3) of (left u, right u, v), the right one being left minus disparity."""
+    """Covariance (3, 3) of (left u, right u, v), where right u is left u minus disparity."""
     pixel = sigma_px**2
     return np.array(
         [[pixel, pixel, 0.0], [pixel, pixel + sigma_disparity**2, 0.0], [0.0, 0.0, pixel]]
@@ -140,10 +140,10 @@ def _robust(gtsam: Any, covariance: Float64) -> Any:
 
 
 def adjust_around(sparse_map: SparseMap, keyframe: int, size: int) -> None:
-    """Adjust ``size`` keyframes, those that share most points with one, and the points they see.
+    """Adjust the ``size`` keyframes that share most points with one, and the points they see.
 
-    Other keyframes that see these points hold them in place. Sightings that do not fit afterwards
-    are forgotten.
+    Other keyframes that see these points stay fixed as anchors. Sightings that do not fit
+    afterwards are removed.
     """
     window, anchors = _choose_keyframes(sparse_map, keyframe, size)
     keyframes = window + anchors
@@ -163,7 +163,7 @@ def adjust_around(sparse_map: SparseMap, keyframe: int, size: int) -> None:
 def _choose_keyframes(
     sparse_map: SparseMap, keyframe: int, size: int
 ) -> tuple[list[int], list[int]]:
-    """Keyframes that are adjusted, and others that hold them in place."""
+    """Select keyframes to adjust, and others to hold them in place."""
     window = [keyframe, *sparse_map.neighbours(keyframe, size - 1)]
     others = [k for k in range(len(sparse_map.keyframes)) if k not in window]
     counts = sparse_map.shared(sparse_map.points_of(window), others)
@@ -177,7 +177,7 @@ def _gather(
     fixed: NDArray[np.bool_],
     point_ids: Int64,
 ) -> tuple[Bundle, Int64, Int64]:
-    """The points seen twice or more, the feature of each sighting, and the ids of the points."""
+    """A bundle of the points seen at least twice, each sighting's feature, and the point ids."""
     frames = [sparse_map.keyframes[k] for k in keyframes]
     wanted = np.zeros(len(sparse_map.positions) + 1, dtype=bool)  # the last is "none", -1
     wanted[point_ids] = True
@@ -202,12 +202,12 @@ def _gather(
 def _forget_outliers(
     sparse_map: SparseMap, keyframes: list[int], bundle: Bundle, feature: Int64
 ) -> None:
-    """Part features from points that they do not show."""
+    """Detach features from points that they do not show."""
     for place, k in enumerate(keyframes):
         here = np.flatnonzero(bundle.camera == place)
         keyframe, seen = sparse_map.keyframes[k], bundle.seen.chosen(here)
         points: Float64 = bundle.points[bundle.point[here]]
         r, _ = residuals(invert(keyframe.T_world_camera), points, seen, sparse_map.intrinsics)
         limit = np.where(seen.inverse_depth > 0, CHI2_PIXEL_AND_DEPTH, CHI2_PIXEL)
-        bad = (r**2).sum(axis=1) > 2 * limit  # twice: what the next adjustment may still mend
+        bad = (r**2).sum(axis=1) > 2 * limit  # twice: the next adjustment may fix them
         keyframe.point_ids[feature[here[bad]]] = -1

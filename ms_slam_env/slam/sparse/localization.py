@@ -1,4 +1,4 @@
-"""Finds the pose of a frame in the map: near a pose, or by the looks of a keyframe."""
+"""Localises a frame in the map, near a known pose or by matching it with a keyframe."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from ms_slam_env.slam.sparse.sparse_config import (
 )
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
-_LEAST_OVERLAP = 0.3  # share of a frame's readings that the keyframe beside it must show
-_LEAST_INLIERS, _LEAST_ALIKE = 0.75, 0.8  # shares of those that must fit its depth, its intensity
-_SAME_PX = 1.0  # corners closer than this to a point's place are that point
-_RADIUS = 0.045  # of the search for a point, share of the image's width
-_NEIGHBOURS = 6  # keyframes, besides the reference, whose points are looked for
+_LEAST_OVERLAP = 0.3  # share of a frame's readings that its reference keyframe must show
+_LEAST_INLIERS, _LEAST_ALIKE = 0.75, 0.8  # shares that must fit its depth and its intensity
+_SAME_PX = 1.0  # corners closer than this to a point's position show that point
+_RADIUS = 0.045  # search radius around a projected point, share of the image's width
+_NEIGHBOURS = 6  # keyframes, besides the reference, whose points are searched for
 _RANSAC_SIGMAS = 3.0
 _SIGMA_STEP_PX = 0.1
 _CORNER_SHIFT_PX = 1.5  # largest correction of a corner
-_SAMPLES = 1000  # readings that a pose is judged by
-_LEAST_EXPLAINED = 0.25  # share of the matches
+_SAMPLES = 1000  # readings used to verify a pose
+_LEAST_EXPLAINED = 0.25  # share of the matches that the pose must explain
 _PATCH_SHIFT_PX = 3.0  # largest distance of a patch from where its point projects to
 
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """A frame that is to be placed."""
+    """A frame to be localised."""
 
     image: DepthImage  # its depth and intensity
-    inverse_depth: InverseDepth  # its depth for points between pixels
+    inverse_depth: InverseDepth  # its inverse depth with subpixel lookup
     features: Features  # its features
-    tree: cKDTree | None  # of the features' pixels; None if there are none
+    tree: cKDTree | None  # k-d tree of the features' pixels; None if there are none
 
     @property
     def readings(self) -> float:
@@ -61,19 +61,19 @@ class LiveFrame:
 
 @dataclass(frozen=True)
 class Fix:
-    """A pose and what speaks for it."""
+    """A pose with its supporting matches."""
 
     T_world_camera: Float64  # (4, 4) pose
     reference: int  # the keyframe that shares most of its points
-    point_ids: Int64  # (M,) points that the frame shows where the pose has them
+    point_ids: Int64  # (M,) points that the frame shows where the pose predicts them
     features: Int64  # (M,) features of the frame that show them; -1 where a patch does
-    seen: Sightings  # where the frame shows them, to a fraction of a pixel
-    matches: int  # how many matches there were, M of which the pose explains
+    seen: Sightings  # their subpixel positions in the frame
+    matches: int  # number of matches, M of which the pose explains
     visible: Int64  # (V,) points that should be in the image
 
 
 class Localizer:
-    """Places frames in a map."""
+    """Localises frames in a map."""
 
     def __init__(self, sparse_map: SparseMap) -> None:
         self._map = sparse_map
@@ -85,10 +85,10 @@ class Localizer:
         )
 
     def near(self, frame: LiveFrame, T_world_camera: Float64, reference: int) -> Fix | None:
-        """Place a frame that is near a pose and sees what the reference keyframe sees.
+        """Localise a frame near a pose that sees what the reference keyframe sees.
 
-        The points are sought among the features near where they project to; then as patches of
-        the keyframe, to a fraction of a pixel.
+        Points are matched with features near their projections, and then refined to subpixel
+        accuracy with patches of the keyframe.
         """
         keyframes = [reference, *self._map.neighbours(reference, _NEIGHBOURS)]
         candidates = self._map.points_of(keyframes)
@@ -112,7 +112,7 @@ class Localizer:
     def _match(
         self, frame: LiveFrame, candidates: Int64, T_world_camera: Float64
     ) -> tuple[Int64, Int64]:
-        """Points, of the candidates, and features that match near where they project to."""
+        """Match candidate points with features near their projections."""
         visible, projected = self._project(candidates, T_world_camera)
         if frame.tree is None or len(visible) == 0:
             return visible[:0], visible[:0]
@@ -127,7 +127,7 @@ class Localizer:
         return visible[points], features
 
     def by_looks(self, frame: LiveFrame, keyframe: int) -> Float64 | None:
-        """A pose of a frame that shows what a keyframe shows, wherever that was."""
+        """Estimate a frame's pose from its matches with a keyframe, without an initial guess."""
         other = self._map.keyframes[keyframe]
         theirs = np.flatnonzero(other.point_ids >= 0)
         a, b = match_anywhere(
@@ -145,7 +145,7 @@ class Localizer:
         return refine_pose(T, points[inlier], seen, self._intrinsics)[0]
 
     def verify(self, fix: Fix, frame: LiveFrame) -> Attempt[Fix]:
-        """Judge a pose by its matches, and by depth and intensity of the keyframe beside it."""
+        """Verify a pose by its matches, and by depth and intensity of its reference keyframe."""
         explained = len(fix.point_ids)
         reason, found = "", NO_ALIGNMENT
         if explained < LEAST_MATCHES:
@@ -160,7 +160,7 @@ class Localizer:
         return Attempt(fix.T_world_camera, found, reason, fix)
 
     def _sightings(self, features: Features, which: Int64) -> Sightings:
-        """Measurements of some features."""
+        """Measurements of the selected features."""
         return Sightings(
             features.pixels[which],
             features.inverse_depth[which],
@@ -169,7 +169,7 @@ class Localizer:
         )
 
     def _project(self, point_ids: Int64, T_world_camera: Float64) -> tuple[Int64, Float64]:
-        """Those of the points that are in the image, and where (V, 2)."""
+        """Project points; return the ids of those in the image and their pixels (V, 2)."""
         points = transform_points(invert(T_world_camera), self._map.positions[point_ids])
         ahead = points[:, 2] > 0.1
         point_ids, points = point_ids[ahead], points[ahead]
@@ -187,7 +187,7 @@ class Localizer:
         ids: Int64,
         features: Int64,
     ) -> tuple[Int64, Int64, Sightings]:
-        """Points, features (-1 where there is none) and sightings, from matches and patches."""
+        """Combine matches and patches: points, features (-1 for a patch) and sightings."""
         feature_of = np.full(len(self._map.positions), -1)
         feature_of[ids] = features
         matched = feature_of[visible] >= 0
@@ -202,7 +202,7 @@ class Localizer:
         sharp, pixels = visible[found], pixels[found]
         rest = ~np.isin(ids, sharp)
         other = self._sightings(frame.features, features[rest])
-        # Rounded up: adjustment keeps one model of the noise for each value.
+        # Rounded up: bundle adjustment keeps one noise model per value.
         sigma = np.ceil(sigma[found] / _SIGMA_STEP_PX) * _SIGMA_STEP_PX
         seen = Sightings(
             np.concatenate([pixels, other.pixels]),
@@ -216,7 +216,7 @@ class Localizer:
     def _patches(
         self, ids: Int64, shift: Float64, T_world_camera: Float64
     ) -> tuple[Patches, Templates]:
-        """The patches of points in the keyframes that made them."""
+        """Patches of points in the keyframes that created them."""
         T_camera_world = invert(T_world_camera)
         pixels, slope = np.empty((len(ids), 2)), np.empty((len(ids), 2))
         motion = np.empty((len(ids), 4, 4))
@@ -240,9 +240,9 @@ class Localizer:
 def keyframe_features(
     frame: LiveFrame, fix: Fix | None, sparse_map: SparseMap, pixel_noise: float
 ) -> tuple[Features, Int64]:
-    """Features of a frame that becomes a keyframe, and the point (N,) that each shows or -1.
+    """Features of a new keyframe, and the point id (N,) that each shows, or -1.
 
-    Points that were found come first, where they were found; corners beside them are left out.
+    Tracked points come first, at their measured positions; corners next to them are left out.
     """
     features = frame.features
     if fix is None:

@@ -1,4 +1,4 @@
-"""Recognises a place, and makes the map agree with it by a pose graph through GTSAM."""
+"""Closes loops: recognises a place and corrects the map by a pose graph, with GTSAM."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from ms_slam_env.slam.sparse.local_mapping import load_gtsam
 from ms_slam_env.slam.sparse.localization import Fix, LiveFrame, Localizer
 from ms_slam_env.slam.sparse.sparse_map import SparseMap
 
-_LOOP_GAP = 10  # keyframes between a frame and one that it may close a loop with
+_LOOP_GAP = 10  # least number of keyframes between the two ends of a loop
 _FIXED_SIGMA = 1e-6
 _ITERATIONS = 20
-_CANDIDATES = 3  # keyframes that are looked at
-_SHARED_POINTS = 30  # of an edge between keyframes
-# Surer than other edges, which stand for errors that add up, and of which many run side by side.
+_CANDIDATES = 3  # keyframes tested per loop search
+_SHARED_POINTS = 30  # least for an edge between keyframes
+# Tighter than other edges, whose errors add up, and many of which run in parallel.
 _LOOP_M, _LOOP_RAD = 0.002, 0.001
-_SMALL_M, _SMALL_RAD = 0.003, 0.002  # loops off by less need no pose graph
+_SMALL_M, _SMALL_RAD = 0.003, 0.002  # smaller loop errors need no pose graph
 
 
 @dataclass(frozen=True)
 class Edge:
     """The measured motion between two poses."""
 
-    a: int  # index of the one,
-    b: int  # index of the other
+    a: int  # index of the first pose
+    b: int  # index of the second pose
     T_a_b: Float64  # (4, 4) motion
-    sigma_rad: float = 0.005  # standard deviation of its rotation,
-    sigma_m: float = 0.01  # and translation
+    sigma_rad: float = 0.005  # standard deviation of its rotation
+    sigma_m: float = 0.01  # standard deviation of its translation
 
 
 def optimise_poses(poses: Float64, edges: Sequence[Edge], fixed: NDArray[np.bool_]) -> Float64:
-    """Poses (K, 4, 4) of least squares; those that are ``fixed`` (K,) stay."""
+    """Least-squares poses (K, 4, 4); ``fixed`` ones (K,) do not move."""
     gtsam = load_gtsam()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     stay = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED_SIGMA)
@@ -64,7 +64,7 @@ def optimise_poses(poses: Float64, edges: Sequence[Edge], fixed: NDArray[np.bool
 
 
 class LoopCloser(Stateful):
-    """Closes loops of a map."""
+    """Closes loops in a map."""
 
     def __init__(self, sparse_map: SparseMap, localizer: Localizer) -> None:
         self._map = sparse_map
@@ -82,7 +82,7 @@ class LoopCloser(Stateful):
         return None
 
     def _candidates(self, keyframe: int) -> list[int]:
-        """Old keyframes that look like one and do not see its points already."""
+        """Old keyframes that look similar but do not share its points already."""
         old = keyframe - _LOOP_GAP
         if old < 1:
             return []
@@ -96,7 +96,7 @@ class LoopCloser(Stateful):
         return [rest[index] for index in alike]
 
     def _join(self, keyframe: int, fix: Fix) -> Loop:
-        """Bend the trajectory so that the loop closes, then let both ends see the same points."""
+        """Correct the trajectory to close the loop, then merge the points seen at both ends."""
         frames = self._map.keyframes
         known = frames[fix.reference].T_world_camera
         motion = invert(known) @ fix.T_world_camera
@@ -122,7 +122,7 @@ class LoopCloser(Stateful):
         self._map.move({int(k): optimised[k] for k in moved})
 
     def _edges_of(self, poses: Float64) -> list[Edge]:
-        """Motions between keyframes as they are now: consecutive ones, and those sharing points."""
+        """Current motions between consecutive keyframes, and between those that share points."""
         edges = []
         closed = {frozenset((edge.a, edge.b)) for edge in self.edges}
         near = self._map.neighbours_of_each(range(len(poses)), 10, _SHARED_POINTS)
@@ -133,7 +133,7 @@ class LoopCloser(Stateful):
         return edges
 
     def _share_points(self, keyframe: int, fix: Fix) -> None:
-        """Merge the keyframe's points with those of the old ones that it shows as well."""
+        """Merge the keyframe's points with the old points that it also shows."""
         end = self._map.keyframes[keyframe]
         is_corner = (fix.features >= 0) & ~np.isin(fix.point_ids, end.seen_points())
         features, theirs = fix.features[is_corner], fix.point_ids[is_corner]
@@ -157,7 +157,7 @@ class LoopCloser(Stateful):
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state."""
+        """Restore a state."""
         ends = state["ends"].tolist()
         self.edges = [
             Edge(a, b, T.copy(), _LOOP_RAD, _LOOP_M)

@@ -12,9 +12,9 @@ PIXEL_NOISE = 0.7  # standard deviation of a corner's position, pixels
 INVERSE_DEPTH_NOISE = 0.004
 """Standard deviation of the inverse of a corner's depth, 1/m.
 
-Structured light errs by a constant one, so that the error of depth grows with depth squared.
+Constant for structured light, so that the depth error grows with depth squared.
 """
-LEAST_MATCHES = 15  # that a pose must explain to be believed
+LEAST_MATCHES = 15  # that a pose must explain to be accepted
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,10 @@ class SparseConfig(Checked):
 
     Attributes:
         depth_cutoff_m: readings beyond are ignored.
-        features: ORB features taken from a frame at most.
+        features: most ORB features per frame.
         levels: levels of ORB's image pyramid, each 1.2 times smaller than the one before.
-        window: keyframes that local bundle adjustment moves.
-        loops: whether loops are closed.
+        window: number of keyframes that local bundle adjustment moves.
+        loops: whether to close loops.
         max_surfels: capacity of the dense map; None as in ``SurfelConfig``.
     """
 

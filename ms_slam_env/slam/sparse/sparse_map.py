@@ -1,4 +1,4 @@
-"""Keyframes and the points that they see."""
+"""Sparse map: keyframes and the points that they see."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import ArrayOf, Fields, ListOf, WholeNumber
 from ms_slam_env.slam.sparse.patches import Templates, cut
 
-_TRIED_FRAMES = 8  # frames after which a point that is hardly ever found again is dropped
+_TRIED_FRAMES = 8  # frames after which a point that is rarely found again is dropped
 _FOUND_SHARE = 0.25  # as in ORB-SLAM
 
 
 @dataclass
 class Keyframe:
-    """An image that the map is made of."""
+    """An image stored in the map."""
 
     T_world_camera: Float64  # (4, 4) its pose; optimisation moves it
-    known: bool  # whether the pose was given; optimisation leaves it
+    known: bool  # whether the pose was given; then optimisation does not move it
     frame: int  # number of the frame
     features: Features  # N features
-    point_ids: Int64  # (N,) the point that each shows; -1 = none
+    point_ids: Int64  # (N,) id of the point that each shows; -1 = none
     color: NDArray[np.uint8]  # (H, W, 3) uint8
     intensity: Float32  # (H, W) float32 in [0, 255]
     depth: Float32  # (H, W) float32 metres; 0 = no reading
-    thumbnail: Float32 = field(init=False)  # (D,) unit vector of its looks
+    thumbnail: Float32 = field(init=False)  # (D,) unit vector that summarises its appearance
     templates: Templates = field(init=False)  # the patch around each feature
     # (N, 2) change of inverse depth from pixel to pixel at each feature, 1/m.
     slopes: Float64 = field(init=False)
@@ -47,11 +47,11 @@ class Keyframe:
         self.slopes = InverseDepth(self.depth).slope(self.features.pixels)
 
     def image(self) -> DepthImage:
-        """What frames are compared with."""
+        """The image that frames are compared with."""
         return DepthImage(self.depth, self.intensity)
 
     def seen_points(self) -> Int64:
-        """Ids of the points that it shows."""
+        """Ids of the points it shows."""
         return self.point_ids[self.point_ids >= 0]
 
 
@@ -66,19 +66,19 @@ class SparseMap(Saved):
         self.keyframes: list[Keyframe] = []
         self.positions: Float64 = np.zeros((0, 3))
         self.descriptors: NDArray[np.uint64] = np.zeros((0, 4), dtype=np.uint64)
-        self.hosts: Int64 = np.zeros(0, dtype=np.int64)  # the keyframe that made each point
-        self.host_features: Int64 = np.zeros(0, dtype=np.int64)  # and the feature it shows it as
+        self.hosts: Int64 = np.zeros(0, dtype=np.int64)  # the keyframe that created each point
+        self.host_features: Int64 = np.zeros(0, dtype=np.int64)  # and its feature there
         self.alive: NDArray[np.bool_] = np.zeros(0, dtype=bool)
         self._tried: Int64 = np.zeros(0, dtype=np.int64)
         self._found: Int64 = np.zeros(0, dtype=np.int64)
 
     def add(self, keyframe: Keyframe) -> int:
-        """Add a keyframe and a point for each of its features that has depth and none yet."""
+        """Add a keyframe, and a new point for each feature with depth but no point."""
         index = len(self.keyframes)
         self.keyframes.append(keyframe)
         features = keyframe.features
         known = keyframe.point_ids >= 0
-        self.descriptors[keyframe.point_ids[known]] = features.descriptors[known]  # the latest look
+        self.descriptors[keyframe.point_ids[known]] = features.descriptors[known]  # the latest view
         new = np.flatnonzero((keyframe.point_ids < 0) & (features.inverse_depth > 0))
         keyframe.point_ids[new] = len(self.positions) + np.arange(len(new))
         points = features.points(self.intrinsics)[new]
@@ -94,7 +94,7 @@ class SparseMap(Saved):
         return index
 
     def shared(self, point_ids: Int64, keyframes: Iterable[int]) -> Int64:
-        """How many of some points each of the keyframes sees."""
+        """Count how many of the given points each keyframe sees."""
         wanted = np.zeros(len(self.positions) + 1, dtype=bool)  # the last stands for "none", -1
         wanted[point_ids] = True
         shown, lengths = self._shown(keyframes)
@@ -103,7 +103,7 @@ class SparseMap(Saved):
         return np.asarray(sums[ends] - sums[ends - lengths], dtype=np.int64)
 
     def neighbours(self, keyframe: int, count: int, least: int = 15) -> list[int]:
-        """The keyframes, ``count`` at most, that share most points with one; ``least`` each."""
+        """Up to ``count`` keyframes that share most points with one, at least ``least`` each."""
         everyone = range(len(self.keyframes))
         counts = self.shared(self.keyframes[keyframe].seen_points(), everyone)
         return _most_shared(counts, keyframe, count, least)
@@ -111,7 +111,7 @@ class SparseMap(Saved):
     def neighbours_of_each(
         self, keyframes: Sequence[int], count: int, least: int = 15
     ) -> list[list[int]]:
-        """``neighbours`` of many keyframes at once: one product counts what all pairs share."""
+        """``neighbours`` of many keyframes at once: one matrix product counts the shared points."""
         shown, lengths = self._shown(range(len(self.keyframes)))
         rows = np.repeat(np.arange(len(lengths)), lengths)[shown >= 0]
         shown = shown[shown >= 0]
@@ -125,20 +125,20 @@ class SparseMap(Saved):
         ]
 
     def _shown(self, keyframes: Iterable[int]) -> tuple[Int64, Int64]:
-        """The points of the keyframes' features, one keyframe after another, and how many each."""
+        """Concatenated point ids of the keyframes' features, and their number per keyframe."""
         ids = [self.keyframes[k].point_ids for k in keyframes]
         none = np.zeros(0, dtype=np.int64)
         return np.concatenate([none, *ids]), np.array([len(one) for one in ids], dtype=np.int64)
 
     def points_of(self, keyframes: Iterable[int]) -> Int64:
-        """Ids, sorted, of the living points that some keyframes see."""
+        """Sorted ids of the live points that the keyframes see."""
         wanted = np.zeros(len(self.positions), dtype=bool)
         for k in keyframes:
             wanted[self.keyframes[k].seen_points()] = True
         return np.flatnonzero(wanted & self.alive)
 
     def count_sightings(self, tried: Int64, found: Int64) -> None:
-        """Note points that a frame should have shown, and did; drop those never found again."""
+        """Count points that a frame should have shown, and did; drop those rarely found again."""
         self._tried[tried] += 1
         self._found[found] += 1
         often = self._tried[tried] >= _TRIED_FRAMES
@@ -146,7 +146,7 @@ class SparseMap(Saved):
         self.alive[tried[often & rare]] = False
 
     def move(self, poses: dict[int, Float64]) -> None:
-        """Give keyframes new poses; each takes the points along that it made."""
+        """Move keyframes to new poses, along with the points that each created."""
         motions = np.tile(np.eye(4), (len(self.keyframes), 1, 1))
         for k, pose in poses.items():
             motions[k] = pose @ invert(self.keyframes[k].T_world_camera)
@@ -156,7 +156,7 @@ class SparseMap(Saved):
         self.positions = turned + of_point[:, :3, 3]
 
     def merge(self, kept: Int64, dropped: Int64) -> None:
-        """Let each of the ``dropped`` points (M,) be the one in ``kept`` (M,) beside it."""
+        """Merge each of the ``dropped`` points (M,) into the corresponding one of ``kept`` (M,)."""
         replacement = np.arange(len(self.positions) + 1)  # the last stays for "none", -1
         replacement[dropped] = kept
         replacement[-1] = -1
@@ -184,13 +184,13 @@ class SparseMap(Saved):
         return Fields(like, _why_no_map)
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state."""
+        """Restore a state."""
         super().set_state(state)
         self.keyframes = [_restore(saved) for saved in state["keyframes"]]
 
 
 def _most_shared(counts: Int64, keyframe: int, count: int, least: int) -> list[int]:
-    """The keyframes with the largest counts but for one."""
+    """The keyframes with the largest counts, except the given one."""
     others = np.where(np.arange(len(counts)) == keyframe, 0, counts)
     order = np.argsort(-others, kind="stable")[:count]
     return [int(k) for k in order if others[k] >= least]
@@ -209,7 +209,7 @@ def _save(keyframe: Keyframe) -> dict[str, Any]:
 
 
 def _keyframe_like(shape: tuple[int, int]) -> dict[str, Any]:
-    """What a keyframe is in a state, of an image of ``shape`` (H, W)."""
+    """Template of a keyframe's state for an image of ``shape`` (H, W)."""
     return {
         "T_world_camera": np.eye(4),
         "point_ids": ArrayOf(np.int64, ("features",), least=-1, index_of="points"),
@@ -226,7 +226,7 @@ def _keyframe_like(shape: tuple[int, int]) -> dict[str, Any]:
 
 
 def _why_no_map(state: dict[str, Any]) -> str:
-    """What is wrong between the keyframes of a state and its points."""
+    """What is inconsistent between a state's keyframes and points."""
     features = np.array([len(keyframe["pixels"]) for keyframe in state["keyframes"]], np.int64)
     if (state["host_features"] >= features[state["hosts"]]).any():
         return "has points of features that their keyframes do not have"

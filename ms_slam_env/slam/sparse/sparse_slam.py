@@ -1,8 +1,8 @@
-"""Sparse SLAM with ORB features, as a backend.
+"""The sparse SLAM backend, with ORB features.
 
 ORB-SLAM2 for RGB-D cameras (Mur-Artal and Tardos, TRO 2017, figure 2) without its threads: every
 frame is matched with the points of the local map; keyframes add points, are adjusted with their
-neighbours, and close loops. What a frame shows beyond its corners is the business of the dense map.
+neighbours, and close loops. A separate dense map holds everything beyond the corners.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from ms_slam_env.slam.sparse.sparse_map import Keyframe, SparseMap
 from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
 _KEYFRAME_M, _KEYFRAME_DEG = 0.1, 8.0
-"""A frame becomes a keyframe this far from the others in sight, or turned by this much."""
-_ENOUGH_MATCHES = 60  # a share of that where fewer matches explain its pose, see ``_SOONER``
+"""A frame becomes a keyframe at this distance from its reference keyframe, or this rotation."""
+_ENOUGH_MATCHES = 60  # with fewer, only the share ``_SOONER`` of that motion is needed
 _REMAP_M, _REMAP_DEG = 0.005, 0.3
-"""The dense map is made anew when a keyframe has moved by this much since it was fused."""
+"""The dense map is rebuilt when a keyframe has moved by this much since it was fused."""
 
 
 class DenseMap(Saved):
-    """Surfels fused from keyframes at their poses; made anew when a pose has changed."""
+    """Surfels fused from keyframes at their poses; rebuilt when a pose has changed."""
 
     saved = ("_surfels", "_poses", "_fused")
 
@@ -50,10 +50,10 @@ class DenseMap(Saved):
             SurfelConfig(
                 depth_cutoff_m=config.depth_cutoff_m,
                 max_surfels=config.max_surfels,
-                unstable_window=100_000,  # keyframes are few, and each of them counts
+                unstable_window=100_000,  # keyframes are few, and each one counts
             ),
         )
-        self._poses: list[Float64] = []  # where each keyframe is in the map
+        self._poses: list[Float64] = []  # pose of each keyframe in the map
         self._fused = 0  # how many of them are fused
 
     def state_like(self) -> Any:
@@ -68,7 +68,7 @@ class DenseMap(Saved):
         self._fused = 0
 
     def place(self, keyframes: Sequence[Keyframe]) -> None:
-        """Decide where these keyframes are in the map; nothing is fused before it is looked at."""
+        """Set the keyframes' poses in the map; nothing is fused until the map is used."""
         pairs = zip(self._poses, keyframes, strict=False)
         if any(self._has_moved(placed, keyframe) for placed, keyframe in pairs):
             self.clear()
@@ -76,7 +76,7 @@ class DenseMap(Saved):
             self._poses.append(keyframe.T_world_camera.copy())
 
     def updated(self, keyframes: Sequence[Keyframe]) -> SurfelSlam:
-        """The surfels, once the keyframes that were placed are fused."""
+        """Fuse the placed keyframes, and return the surfels."""
         for keyframe, pose in zip(
             keyframes[self._fused :], self._poses[self._fused :], strict=True
         ):
@@ -93,9 +93,9 @@ class DenseMap(Saved):
         return moved_m > _REMAP_M or turned > _REMAP_DEG
 
 
-_LOOKALIKES = 4  # keyframes in which a lost camera is sought
-_SOONER = 0.25  # share of a keyframe's distance that is enough where matches are few
-_BESIDE = 2  # keyframes beside the guess in which it is sought
+_LOOKALIKES = 4  # keyframes in which a lost camera is searched for
+_SOONER = 0.25  # share of the keyframe motion that is enough if there are few matches
+_BESIDE = 2  # keyframes nearest the guess in which it is searched for
 
 
 class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
@@ -114,7 +114,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
 
     @property
     def needs_color(self) -> bool:
-        """Corners are found in colour."""
+        """Corners are detected in the colour image."""
         return True
 
     @property
@@ -127,7 +127,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
 
     def _clear(self) -> None:
         self._reference = self._frame = 0
-        self._loop: Loop | None = None  # that the frame in hand has closed
+        self._loop: Loop | None = None  # closed by the current frame
         self._map = SparseMap(self.intrinsics)
         self._localizer = Localizer(self._map)
         self._loops = LoopCloser(self._map, self._localizer)
@@ -145,7 +145,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
 
     @property
     def closes_loops(self) -> bool:
-        """Whether they are sought."""
+        """Whether loop closure is enabled."""
         return self.config.loops
 
     @property
@@ -162,7 +162,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
         return self._counted(super().fuse(frame, T_world_camera))
 
     def _counted(self, result: TrackResult) -> TrackResult:
-        """Count a frame; the result with the loop that it has closed."""
+        """Count a frame, and add the loop that it closed to its result."""
         loop, self._loop = self._loop, None
         self._frame += 1
         return replace(result, loop=loop, loop_closed=loop is not None and loop.bent)
@@ -188,7 +188,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
             yield self._localizer.verify(fix, prepared)
 
     def _fixes(self, live: LiveFrame, guess: Float64 | None) -> Iterator[Fix]:
-        """Poses that the frame may have, in the order in which they are tried."""
+        """Candidate poses of the frame, in the order in which they are tried."""
         near, by_looks = self._localizer.near, self._localizer.by_looks
         hypotheses = [(self._pose @ self._motion, self._reference)]
         if guess is not None:
@@ -204,7 +204,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
                 yield fix
 
     def _candidates(self, live: LiveFrame, guess: Float64 | None) -> list[int]:
-        """Keyframes that the frame may look like, each once."""
+        """Keyframes that may show the same place, each once."""
         looks = [keyframe.thumbnail for keyframe in self._map.keyframes]
         wanted = thumbnail(live.image)
         candidates = [self._reference]
@@ -236,7 +236,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
             self._insert(frame, prepared, fix, known=False)
 
     def _is_new(self, fix: Fix) -> bool:
-        """Whether a frame is away from the keyframe beside it; sooner where matches are few."""
+        """Whether a frame is far enough from its reference keyframe; less if matches are few."""
         beside = self._map.keyframes[fix.reference].T_world_camera
         moved = float(np.linalg.norm(fix.T_world_camera[:3, 3] - beside[:3, 3]))
         turned = relative_angle(fix.T_world_camera[:3, :3], beside[:3, :3])
@@ -277,7 +277,7 @@ class SparseSlam(BorrowedMap, FrameByFrameSlam[LiveFrame, Fix]):
 
 
 def _why_no_frame(state: dict[str, Any]) -> str:
-    """What is wrong between the frames of a state that were counted and its keyframes."""
+    """What is inconsistent between a state's frame count and its keyframes."""
     keyframes = state["map"]["keyframes"]
     is_later = keyframes and keyframes[-1]["frame"] >= state["frame"]
     return "has keyframes of later frames than it has counted" if is_later else ""

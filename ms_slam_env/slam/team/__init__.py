@@ -1,1 +1,1 @@
-"""What several robots need: where their maps lie relative to each other, and one map of all."""
+"""Multi-robot SLAM: relative poses of the robots' maps, and one merged map."""

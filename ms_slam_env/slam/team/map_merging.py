@@ -1,9 +1,9 @@
-"""Where two robots' maps lie relative to each other, found from what both saw, or refused.
+"""Finds the relative pose of two robots' maps from what both saw, or refuses.
 
-Every robot's SLAM has a frame of its own. Frames of one robot give guesses of where its map lies in
-the map of the other (:mod:`.relative_map_poses`): by points that look alike, and by relocalising
-them there. A pose that enough of them agree on is refined by registration of the maps, and
-believed if the images of either robot look like the view that the other's map predicts.
+Every robot's SLAM has its own frame. Frames of one robot yield hypotheses of its map's pose in the
+other's map (:mod:`.relative_map_poses`), by matching similar points and by relocalisation. A pose
+that enough hypotheses agree on is refined by registration of the maps. It is accepted if each
+robot's images resemble the views that the other's map predicts.
 """
 
 from __future__ import annotations
@@ -28,22 +28,23 @@ from ms_slam_env.slam.team.relative_map_poses import (
     hypotheses_from_relocalisation,
 )
 
-AGREE_M, AGREE_DEG = 0.10, 5.0  # guesses agree that put robot b's cameras less than this apart
-LEAST_AGREEING, LEAST_SHARE = 3, 0.6  # guesses that must agree, and their share of all
-_SLACK = 0.01  # by which registration may worsen a share of pixels
+AGREE_M, AGREE_DEG = 0.10, 5.0  # hypotheses agree if robot b's cameras differ by less than this
+LEAST_AGREEING, LEAST_SHARE = 3, 0.6  # hypotheses that must agree, and their share of all
+_SLACK = 0.01  # largest loss that registration may cause in a share of pixels
 
 
 @dataclass(frozen=True)
 class MergeConfig(FitConfig):
-    """When two robots' maps are taken to show the same place.
+    """Parameters of map merging.
 
     Attributes:
-        sources: of the guesses.
-        queries: frames of each robot that are compared by their features, and judged by.
-        lost_queries: places on each robot's path from where it is relocalised in the other's map.
-        patience: consecutive frames tried at each.
-        voxel_m: thinning of the maps before they are registered.
-        cutoff_m: farthest pair of points in the registration.
+        sources: sources of the hypotheses.
+        queries: number of frames per robot for feature matching and for verification.
+        lost_queries: number of positions on each robot's path from which it is relocalised in the
+            other's map.
+        patience: number of consecutive frames tried at each position.
+        voxel_m: voxel size for downsampling the maps before registration.
+        cutoff_m: largest distance of corresponding points in the registration.
     """
 
     sources: tuple[str, ...] = SOURCES
@@ -62,26 +63,26 @@ class MergeConfig(FitConfig):
 
 @dataclass(frozen=True)
 class Merge:
-    """What came of an attempt."""
+    """Outcome of a merge attempt."""
 
-    # (4, 4) maps points of map b into map a; None if the maps were not merged.
+    # (4, 4) transforms points of map b into map a; None if the maps were not merged.
     T_a_b: Float64 | None
-    reason: str  # why not; empty if they were
-    found: int = 0  # number of guesses
+    reason: str  # why they were not merged; empty if they were
+    found: int = 0  # number of hypotheses
     agreeing: int = 0  # largest number of them that agree
-    fit: Fit = field(default_factory=Fit)  # of the maps; NaN if no pose was judged
-    # by how much registration moved b's cameras, metres; 0 if it was not accepted.
+    fit: Fit = field(default_factory=Fit)  # of the maps; NaN if no pose was verified
+    # distance that registration moved b's cameras, metres; 0 if it was not accepted.
     refined_m: float = 0.0
 
 
 def merge_maps(a: RobotRun, b: RobotRun, config: MergeConfig | None = None) -> Merge:
-    """Find T_a_b from what the robots saw, or say why there is none to be believed."""
+    """Find T_a_b from the robots' frames, or say why no pose is accepted."""
     config = config or MergeConfig()
     return decide(a, b, find_hypotheses(a, b, config), config)
 
 
 def find_hypotheses(a: RobotRun, b: RobotRun, config: MergeConfig) -> list[Hypothesis]:
-    """Guesses of T_a_b, from the frames of both robots."""
+    """Collect hypotheses of T_a_b from the frames of both robots."""
     found: list[Hypothesis] = []
     if SOURCES[0] in config.sources:
         found += hypotheses_from_features(a, b, config.queries)
@@ -97,7 +98,7 @@ def find_hypotheses(a: RobotRun, b: RobotRun, config: MergeConfig) -> list[Hypot
 def decide(
     a: RobotRun, b: RobotRun, hypotheses: Sequence[Hypothesis], config: MergeConfig
 ) -> Merge:
-    """The pose that the guesses agree on, refined, if the maps bear it out."""
+    """Refine the pose that the hypotheses agree on, and accept it if the maps confirm it."""
     if not (a.tracked.any() and b.tracked.any()):
         return Merge(None, "a robot has tracked no frame")
     centre = b.estimates[b.tracked, :3, 3].mean(axis=0)
@@ -122,7 +123,7 @@ def decide(
 
 
 def refine(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Float64:
-    """T_a_b (4, 4) after registration of the maps from that start."""
+    """Refine T_a_b (4, 4) by registration of the maps."""
     target = voxel_downsample(a.backend.surface_points(), config.voxel_m)
     source = voxel_downsample(b.backend.surface_points(), config.voxel_m)
     moved = transform_points(T_a_b, source)
@@ -132,9 +133,10 @@ def refine(a: RobotRun, b: RobotRun, T_a_b: Float64, config: MergeConfig) -> Flo
 def consensus(
     hypotheses: Sequence[Hypothesis], centre: Float64, agree_m: float, agree_deg: float
 ) -> list[Hypothesis]:
-    """The hypotheses that agree with the one that most agree with, by their number.
+    """The largest set of hypotheses that agree with one of them.
 
-    Two agree if they put the point ``centre`` (3,) of map b at about the same place and turn alike.
+    Two agree if they put the point ``centre`` (3,) of map b at about the same place and their
+    rotations are similar.
     """
     best: list[Hypothesis] = []
     for one in hypotheses:
@@ -149,14 +151,14 @@ def consensus(
 
 
 def pose_difference(T: Float64, T_other: Float64, point: Float64) -> tuple[float, float]:
-    """Distance in metres between where two poses put a point (3,), and their angle in degrees."""
+    """Distance in metres between a point (3,) moved by two poses, and their angle in degrees."""
     moved = transform_points(T, point[None]) - transform_points(T_other, point[None])
     angle = relative_angle(T[:3, :3], T_other[:3, :3])
     return float(np.linalg.norm(moved)), float(np.degrees(angle))
 
 
 def mean_pose(hypotheses: Sequence[Hypothesis], centre: Float64) -> Float64:
-    """Weighted mean (4, 4) of hypotheses that lie close together, taken about a point of map b."""
+    """Weighted mean (4, 4) of nearby hypotheses, taken about the point ``centre`` of map b."""
     T_b_centre = np.eye(4)
     T_b_centre[:3, 3] = centre
     poses = [hypothesis.T_a_b @ T_b_centre for hypothesis in hypotheses]

@@ -1,9 +1,8 @@
-"""Hypotheses of where two robots' maps lie relative to each other.
+"""Hypotheses of the relative pose of two robots' maps.
 
-Relocalisation finds a frame in a map that was seen from about the same place. Two robots rather see
-the same things from different places, so points are matched by their looks too (SIFT, Lowe, IJCV
-2004), and three matches give a relative pose (RANSAC, Fischler and Bolles, 1981), since depth puts
-every point into space.
+Relocalisation needs a view from about the same place. Two robots usually see the same things from
+different places, so points are also matched by appearance (SIFT, Lowe, IJCV 2004). Since depth
+gives every point in 3D, three matches yield a relative pose (RANSAC, Fischler and Bolles, 1981).
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ SOURCES = (FEATURES, RELOCALISATION)
 
 _LEAST_MATCHES = 8
 _MATCH_TOLERANCE_M = 0.02  # at 1 m
-_MAGNIFY_TO = 640  # columns of the image in which corners are sought
+_MAGNIFY_TO = 640  # columns of the image in which corners are detected
 _MOST_FEATURES = 400
 _RATIO = 0.8  # the best match must be this much better than the second best
-_TRIALS = 300  # of three matches
+_TRIALS = 300  # RANSAC samples of three matches
 _REFITS = 3
-_RELOCALISED_WEIGHT = 30.0  # of a relocalised frame, in matches of features
+_RELOCALISED_WEIGHT = 30.0  # of a relocalised frame, in feature matches
 
 
 @dataclass(frozen=True)
@@ -42,11 +41,11 @@ class RobotRun:
     """A robot that has finished its path.
 
     Raises:
-        InputError: no frame, or another number of poses or flags than of frames.
+        InputError: no frame, or the number of poses or flags differs from that of frames.
     """
 
     backend: SlamBackend  # its SLAM, with the map
-    frames: Sequence[RGBDFrame]  # N, what it saw
+    frames: Sequence[RGBDFrame]  # N, all that it captured
     estimates: Float64  # (N, 4, 4) T_map_camera, in the frame of its own map
     tracked: NDArray[np.bool_]  # (N,) bool
 
@@ -63,18 +62,18 @@ class RobotRun:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A guess from one frame."""
+    """A hypothesis of T_a_b from one frame."""
 
-    T_a_b: Float64  # (4, 4) maps points of map b into map a
+    T_a_b: Float64  # (4, 4) transforms points of map b into map a
     weight: float  # matches behind it
     source: str  # one of ``SOURCES``
 
 
 def hypotheses_from_features(a: RobotRun, b: RobotRun, queries: int) -> list[Hypothesis]:
-    """From points that look alike in a frame of robot b and in frames of robot a."""
+    """Hypotheses from similar points in a frame of robot b and in frames of robot a."""
     K = a.backend.intrinsics
     known = [landmarks(a.frames[k], a.estimates[k], K) for k in query_frames(a, queries)]
-    rng = np.random.default_rng(0)  # fixed: the same maps merge in the same way
+    rng = np.random.default_rng(0)  # fixed, so that the same maps merge in the same way
     found = []
     for index in query_frames(b, queries):
         seen = landmarks(b.frames[index], b.estimates[index], K)
@@ -87,10 +86,10 @@ def hypotheses_from_features(a: RobotRun, b: RobotRun, queries: int) -> list[Hyp
 def hypotheses_from_relocalisation(
     a: RobotRun, b: RobotRun, queries: int, patience: int
 ) -> list[Hypothesis]:
-    """From frames of robot b that the SLAM of robot a finds in its map; that is left as it was.
+    """Hypotheses from frames of robot b that robot a's SLAM relocalises in its map.
 
-    SLAM is told nothing: it sees a black frame, is lost, and then sees up to ``patience``
-    consecutive frames of robot b, as after a kidnapping.
+    SLAM gets no guess: it sees a black frame, loses tracking, and then sees up to ``patience``
+    consecutive frames of robot b, as after a kidnapping. Its state is restored afterwards.
     """
     state = a.backend.get_state()
     height, width = b.frames[0].depth.shape
@@ -115,11 +114,11 @@ class Landmarks:
 
     points: Float64  # (N, 3) in the frame of the robot's map
     descriptors: NDArray[np.float32]  # (N, 128) float32, RootSIFT
-    depth_m: Float64  # (N,) distance along the optical axis, by which their error grows
+    depth_m: Float64  # (N,) distance along the optical axis; their error grows with it
 
 
 def landmarks(frame: RGBDFrame, T_map_camera: Float64, K: Intrinsics) -> Landmarks:
-    """Points with known depth that can be recognised; none in an image without texture."""
+    """Extract recognisable points with known depth; none in an image without texture."""
     grey = intensity_image(frame.color).round().astype(np.uint8)
     n = max(1, round(_MAGNIFY_TO / K.width))
     image = cv2.resize(grey, (n * K.width, n * K.height), interpolation=cv2.INTER_CUBIC)
@@ -147,8 +146,8 @@ def match_landmarks(
 ) -> tuple[Float64, int] | None:
     """Find where the frame of robot b lies in map a: T_a_b (4, 4) and the matches behind it.
 
-    Of the frames of robot a the one with most inliers, at least ``least_inliers``, counts. They fit
-    to ``tolerance_m`` at 1 m, which grows with depth squared as the sensor's noise does.
+    Uses the frame of robot a with most inliers, at least ``least_inliers``. An inlier fits to
+    ``tolerance_m`` at 1 m; the tolerance grows with depth squared, as the sensor's noise does.
     """
     best: tuple[Float64, int] | None = None
     for one in a:
@@ -166,7 +165,7 @@ def match_landmarks(
 def _matches(
     a: NDArray[np.float32], b: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices (M,) of descriptors that are each other's best and clearly better than the second."""
+    """Indices (M,) of descriptors that are mutually best and clearly better than the second."""
     none = np.zeros(0, dtype=np.int64)
     if len(a) < 2 or len(b) < 2:
         return none, none
@@ -185,7 +184,7 @@ def _matches(
 def _rigid_motion(
     a: Float64, b: Float64, tolerances: Float64, rng: np.random.Generator
 ) -> tuple[Float64, int] | None:
-    """T_a_b (4, 4) that most of the pairs (N, 3), (N, 3) fit, and their number; None without."""
+    """T_a_b (4, 4) that fits most of the pairs (N, 3), (N, 3), and their number; None if none."""
     best, most = None, 2
     trials = np.stack([rng.choice(len(a), 3, replace=False) for _ in range(_TRIALS)])
     for chosen in trials[_are_rigid(a[trials], b[trials], tolerances[trials])]:
@@ -203,7 +202,7 @@ def _rigid_motion(
 
 
 def _are_rigid(a: Float64, b: Float64, tolerances: Float64) -> NDArray[np.bool_]:
-    """Which triangles (T, 3, 3) have the same sides in both sets, none of them tiny."""
+    """Which triangles (T, 3, 3) have equal side lengths in both sets, none of them tiny."""
     rigid = np.ones(len(a), dtype=bool)
     for i, j in ((0, 1), (1, 2), (2, 0)):
         in_a, in_b = (np.linalg.norm(x[:, i] - x[:, j], axis=1) for x in (a, b))

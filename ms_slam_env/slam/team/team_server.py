@@ -1,10 +1,10 @@
-"""The server of a team: one pose graph over the keyframes of all robots, one map of their frames.
+"""The server of a team: one pose graph over all robots' keyframes, one map of their frames.
 
 Qu, Zhang, Yang, Dong, "USME", Navigation Positioning and Timing 2021, section 4: the back end of
 several robots receives their keyframes, optimises the poses of every robot, and fuses, denoises and
-optimises their maps. The graph has the motion that each robot's SLAM says between its neighbouring
-keyframes, and where keyframes of one robot lie in the map of another, to which they are registered
-(GICP): a map is the mean of many frames, two frames by themselves fit worse.
+optimises their maps. The graph contains the motion between neighbouring keyframes as estimated by
+each robot's SLAM, and poses of one robot's keyframes in another's map from registration (GICP). A
+map averages many frames, so this fits better than registering two frames.
 """
 
 from __future__ import annotations
@@ -27,16 +27,13 @@ from ms_slam_env.slam.sparse.pose_graph import Edge, optimise_poses
 from ms_slam_env.slam.team.relative_map_poses import RobotRun
 
 AGREE_M, AGREE_DEG = 0.2, 5.0
-"""A keyframe found in another map farther than this from where the merged maps put it is left out.
-
-So is one that is turned by more.
-"""
-LEAST_SHARE = 0.6  # of a keyframe's points that must lie on the other map
-MATCH_M, MATCH_RAD = 0.01, 0.006  # error of a keyframe registered in another map
+"""A keyframe is left out if its pose in another map is farther from that of the merged maps."""
+LEAST_SHARE = 0.6  # share of a keyframe's points that must lie on the other map
+MATCH_M, MATCH_RAD = 0.01, 0.006  # standard deviation of a keyframe registered in another map
 _FAR_M = 4.0  # readings beyond are too noisy to be registered
 _VOXEL_M = 0.02
-_FEWEST, _MATCHED = 200, 800  # points that are registered
-_SURE = 5e-4  # metres and radians that a motion is never surer than
+_FEWEST, _MATCHED = 200, 800  # least and largest number of points to register
+_SURE = 5e-4  # least standard deviation of a motion, metres and radians
 
 
 @dataclass(frozen=True)
@@ -44,8 +41,8 @@ class ServerConfig(Checked):
     """How the keyframes of a team are joined.
 
     Attributes:
-        keyframes: of each robot, evenly spread over its tracked frames.
-        cutoff_m: farthest pair of points in the registration.
+        keyframes: number per robot, evenly spread over its tracked frames.
+        cutoff_m: largest distance of corresponding points in the registration.
         drift: error of the motion between neighbouring keyframes, as a share of it.
     """
 
@@ -56,11 +53,11 @@ class ServerConfig(Checked):
 
 @dataclass(frozen=True)
 class TeamEstimate:
-    """What the server made of a team.
+    """The server's result for a team.
 
     Attributes:
-        trajectories: by robot (N, 4, 4), T_world_camera of all of its frames in the first frame.
-        links: keyframes that were found in the map of another robot.
+        trajectories: by robot (N, 4, 4), T_world_camera of all its frames in the common frame.
+        links: number of keyframes registered in another robot's map.
     """
 
     trajectories: Mapping[int, Float64]
@@ -69,11 +66,11 @@ class TeamEstimate:
 
 @dataclass(frozen=True)
 class _Keyframe:
-    """A frame of a robot that stands in the graph."""
+    """A robot's frame in the pose graph."""
 
     robot: int
     index: int  # of the frame
-    T_world_camera: Float64  # (4, 4) in the common frame, before
+    T_world_camera: Float64  # (4, 4) in the common frame, before optimisation
     cloud: Float64  # (M, 3) in the camera's frame
 
 
@@ -82,13 +79,13 @@ def optimise_team(
     T_world_map: Mapping[int, Float64],
     config: ServerConfig | None = None,
 ) -> TeamEstimate:
-    """Trajectories of robots that agree with what any two of them saw of one place.
+    """Optimise the robots' trajectories so that their views of common places agree.
 
     Args:
-        robots: of whom those in ``T_world_map`` are joined.
-        T_world_map: (4, 4) by robot: where the frame of its map lies in the common one. The first
-            keyframe of the first robot stays where it is.
-        config: of the graph.
+        robots: all robots; those in ``T_world_map`` are joined.
+        T_world_map: (4, 4) by robot, the pose of its map in the common frame. The first keyframe of
+            the first robot stays fixed.
+        config: parameters of the graph.
     """
     config = config or ServerConfig()
     keyframes = [
@@ -121,10 +118,10 @@ def optimise_team(
 def fuse_team(
     backend: SlamBackend, robots: Sequence[RobotRun], estimate: TeamEstimate, every: int = 1
 ) -> SlamBackend:
-    """Fuse the tracked frames of all robots into one map, at the poses of the server.
+    """Fuse the tracked frames of all robots into one map, at the server's poses.
 
-    What only a frame or two show, the backend's own fusion does not take for surface: that is the
-    denoising. Returns the ``backend``.
+    Denoising comes from the backend's fusion, which does not accept points seen in only one or two
+    frames as surface. Returns the ``backend``.
     """
     backend.reset(next(iter(estimate.trajectories.values()))[0])
     for k, poses in estimate.trajectories.items():
@@ -142,14 +139,14 @@ def _keyframes(number: int, robot: RobotRun, T: Float64, count: int) -> list[_Ke
 
 
 def _cloud(frame: RGBDFrame, K: Intrinsics) -> Float64:
-    """Points (M, 3) of a frame, in the camera's frame."""
+    """Points (M, 3) of a frame in the camera frame."""
     near = (frame.depth > 0) & (frame.depth < _FAR_M)
     points = K.rays()[near] * frame.depth[near][:, None]
     return voxel_downsample(points, _VOXEL_M) if len(points) else points
 
 
 def _motion(a: int, b: int, keyframes: Sequence[_Keyframe], drift: float) -> Edge:
-    """What SLAM says of the way between neighbouring keyframes of a robot."""
+    """SLAM's estimate of the motion between neighbouring keyframes of a robot."""
     T = invert(keyframes[a].T_world_camera) @ keyframes[b].T_world_camera
     metres, angle = float(np.linalg.norm(T[:3, 3])), relative_angle(np.eye(3), T[:3, :3])
     return Edge(a, b, T, _SURE + drift * angle, _SURE + drift * metres)
@@ -158,7 +155,7 @@ def _motion(a: int, b: int, keyframes: Sequence[_Keyframe], drift: float) -> Edg
 def _links(
     keyframes: Sequence[_Keyframe], maps: Mapping[int, Float64], config: ServerConfig
 ) -> list[Edge]:
-    """Relative poses of keyframes of two robots, of which one is registered in the other's map."""
+    """Relative poses of two robots' keyframes, one registered in the other's map."""
     found = []
     for b, seen in enumerate(keyframes):
         for robot, points in maps.items():
@@ -173,7 +170,7 @@ def _links(
 
 
 def _registered(seen: _Keyframe, points: Float64, config: ServerConfig) -> Float64 | None:
-    """T_world_camera (4, 4) by which a keyframe fits a map (M, 3), if it does, near where it is."""
+    """Register a keyframe with a map (M, 3); return T_world_camera (4, 4) if it fits nearby."""
     moved = transform_points(seen.T_world_camera, seen.cloud)
     if len(moved) < _FEWEST:
         return None
@@ -188,7 +185,7 @@ def _registered(seen: _Keyframe, points: Float64, config: ServerConfig) -> Float
 
 
 def _nearest(T: Float64, keyframes: Sequence[_Keyframe], robot: int) -> int:
-    """The keyframe of a robot taken nearest to a pose (4, 4)."""
+    """A robot's keyframe nearest to a pose (4, 4)."""
     own = [k for k, keyframe in enumerate(keyframes) if keyframe.robot == robot]
     away = [np.linalg.norm(se3_log(invert(keyframes[k].T_world_camera) @ T)) for k in own]
     return own[int(np.argmin(away))]
@@ -201,7 +198,7 @@ def _agree(T: Float64, expected: Float64) -> bool:
 
 
 def _carried_along(poses: Float64, at: Int64, corrections: Float64) -> Float64:
-    """Poses (N, 4, 4) moved with the keyframes ``at`` (K,), in between by a share of the motion."""
+    """Move poses (N, 4, 4) with the keyframes ``at`` (K,), interpolating in between."""
     moved = np.empty_like(poses)
     for k, pose in enumerate(poses):
         after = int(np.clip(np.searchsorted(at, k, side="right"), 1, max(1, len(at) - 1)))

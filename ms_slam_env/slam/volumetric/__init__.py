@@ -1,4 +1,4 @@
-"""Volumetric SLAM: a truncated signed distance function, tracked frame to model."""
+"""Volumetric SLAM: a truncated signed distance function with frame-to-model tracking."""
 
 from ms_slam_env.slam.volumetric.kinect_fusion import KinectFusionConfig, KinectFusionSlam
 from ms_slam_env.slam.volumetric.volumetric_slam import VolumetricSlam

@@ -1,14 +1,13 @@
 """KinectFusion with its own parameters, on the voxel grid of the volumetric SLAM.
 
-Newcombe et al. (ISMAR 2011); parameters by the names, and with the defaults, of SLAMBench (Nardi et
-al., ICRA 2015), whose design space was the first that the paper's authors searched. Geometry
-alone: filter depth, align with the model's view, check, fuse, cast the model anew.
+Newcombe et al. (ISMAR 2011). Parameter names and defaults are those of SLAMBench (Nardi et al.,
+ICRA 2015), whose design space was the first that the paper's authors searched. It uses geometry
+only: filter depth, align with the model's view, check, fuse, ray-cast the model again.
 
-Around it stands what the other backends have: one more check, and other poses to start from where
-that fails; ``stock`` takes both away. It differs from the original: voxels are allocated where
-there is surface (Open3D), and their weights grow without bound, where the original's end at 100.
-``compute_size_ratio`` and ``tracking_rate`` of that space are the configuration's ``image_size``
-and ``keep_every``.
+As in the other backends, there is one more check, and other initial poses are tried if it fails;
+``stock`` disables both. Two differences from the original: voxels are allocated only near surfaces
+(Open3D), and their weights grow without bound instead of up to 100. ``compute_size_ratio`` and
+``tracking_rate`` of that space are the configuration's ``image_size`` and ``keep_every``.
 """
 
 from __future__ import annotations
@@ -33,33 +32,34 @@ from ms_slam_env.slam.volumetric.projective_icp import (
 from ms_slam_env.slam.volumetric.volumetric_slam import FrameToModel, FusedImage, VolumetricSlam
 from ms_slam_env.slam.volumetric.voxel_grid import CastView, VolumetricConfig, VoxelGrid
 
-_COS_ANGLE = 0.8  # least, between the normals of corresponding points
-_LEAST_SHARE = 0.15  # of all pixels that must correspond; with fewer tracking is lost
-_EVERY_FRAME = 4  # frames that are fused whatever the rate, as in SLAMBench
+_COS_ANGLE = 0.8  # least cosine between the normals of corresponding points
+_LEAST_SHARE = 0.15  # share of all pixels that must correspond; with fewer, tracking is lost
+_EVERY_FRAME = 4  # first frames are fused whatever the rate, as in SLAMBench
 
 
 @dataclass(frozen=True)
 class KinectFusionConfig(Checked):
-    """Parameters of KinectFusion; ranges are those that were searched, where they were published.
+    """Parameters of KinectFusion; ranges are the published search ranges where available.
 
     Attributes:
-        volume_size_m: edge of the cube that is mapped; readings outside are not fused.
+        volume_size_m: edge of the mapped cube; readings outside are not fused.
         volume_resolution: voxels along that edge.
-        mu_m: the signed distance is cut off there; at least a voxel counts, at most 50.
-        icp_threshold: length of a step (metres and radians) below which a level of ICP ends.
-        iterations: of ICP at most, per pyramid level, finest first.
-        integration_rate: every how many-th tracked frame is fused.
+        mu_m: truncation of the signed distance; clipped to between 1 and 50 voxels.
+        icp_threshold: step length (metres and radians) below which an ICP level ends.
+        iterations: most ICP iterations per pyramid level, finest first.
+        integration_rate: every n-th tracked frame is fused.
         icp_distance_m: largest distance of corresponding points.
-        track_residual_m: tracking is lost where their RMS distance from the model is larger.
-        start_x: where in the cube the first camera stands, as shares of its edge, x right,
-        start_y: y down,
-        start_z: z forward. SLAMBench maps 4.8 m in 256 voxels, with the first camera at a side of
-            the cube (0.5, 0.5, 0): what lies ahead of it. Here the camera may turn.
+        track_residual_m: tracking is lost if their RMS distance from the model is larger.
+        start_x: x (right) of the first camera in the cube, as a share of its edge.
+        start_y: y (down) of the first camera, as a share.
+        start_z: z (forward) of the first camera, as a share. SLAMBench maps 4.8 m in 256 voxels
+            with the first camera at a side of the cube (0.5, 0.5, 0), so only what lies ahead. Here
+            the camera may turn.
         depth_cutoff_m: readings beyond are ignored.
-        least_weight: observations after which a voxel counts as surface, in predictions and in
-            the surface points.
-        stock: as published: only SLAMBench's two rules decide, intensity plays no part, and no
-            other pose than the last is tried.
+        least_weight: observations that a voxel needs to count as surface in predictions and surface
+            points.
+        stock: as published: only SLAMBench's two rules decide, intensity is not used, and only the
+            last pose is tried.
     """
 
     volume_size_m: float = bounded(8.0, 1.0, 20.0)
@@ -78,13 +78,13 @@ class KinectFusionConfig(Checked):
     stock: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse counts that are none."""
+        """Refuse invalid counts."""
         super().__post_init__()
         check_counts(self, "iterations", 5, 100)
 
     @property
     def grid(self) -> VolumetricConfig:
-        """The grid."""
+        """Parameters of the voxel grid."""
         voxel_m = self.volume_size_m / self.volume_resolution
         return VolumetricConfig(
             voxel_m=float(np.clip(voxel_m, 0.001, 0.2)),
@@ -95,7 +95,7 @@ class KinectFusionConfig(Checked):
 
 
 class ProjectiveAlignment(FrameToModel):
-    """ICP against the model's view, and SLAMBench's check of what it finds."""
+    """ICP against the model's view, with SLAMBench's check of the result."""
 
     def __init__(self, intrinsics: Intrinsics, config: KinectFusionConfig) -> None:
         self._intrinsics, self._config = intrinsics, config
@@ -105,7 +105,7 @@ class ProjectiveAlignment(FrameToModel):
         self._pyramid: list[Surface] = []
 
     def align(self, frame: DepthImage, view: CastView) -> Float64 | None:
-        """T_model_camera (4, 4) of a frame against a view of the model, None if there is none."""
+        """Align a frame with a view of the model; return T_model_camera (4, 4) or None."""
         if frame is not self._frame:
             levels = len(self._config.iterations)
             self._frame, self._pyramid = frame, frame_pyramid(frame.depth, self._intrinsics, levels)
@@ -138,7 +138,7 @@ class KinectFusionSlam(VolumetricSlam):
         super()._start_from(frame, prepared)
 
     def _extend(self, frame: RGBDFrame, prepared: FusedImage, attempt: Attempt[None]) -> None:
-        self._view = None  # the camera has moved
+        self._view = None  # outdated: the camera has moved
         self._tracked += 1
         if self._tracked % self.config.integration_rate == 0 or self._tracked < _EVERY_FRAME:
             self._fuse(prepared)

@@ -1,7 +1,7 @@
 """Point-to-plane alignment of a depth image with a model's view, by projective association.
 
-Newcombe et al., "KinectFusion" (ISMAR 2011), section 3.5: a point of the frame is carried into the
-model's camera, projected, and drawn to the plane of what it lands on,
+Newcombe et al., "KinectFusion" (ISMAR 2011), section 3.5: a point of the frame is transformed into
+the model's camera and projected; its distance to the plane at the point it lands on is minimised,
 
     E = sum (n . (T v - m))^2    over |T v - m| < distance_m and R n_v . n > cos_angle
 
@@ -22,7 +22,7 @@ from ms_slam_env.camera.frame import reduce_depth
 from ms_slam_env.geometry import se3_exp
 from ms_slam_env.slam.volumetric.voxel_grid import CastView, smooth_depth
 
-_SMOOTHING_M = 0.1  # of the bilateral filter of depth, as SLAMBench has it
+_SMOOTHING_M = 0.1  # range of the bilateral depth filter, as in SLAMBench
 _FEWEST_POINTS = 50
 
 
@@ -32,7 +32,7 @@ class Surface:
 
     Attributes:
         points: (h, w) vec3 metres.
-        normals: (h, w) vec3 towards the camera; 0 where there is none.
+        normals: (h, w) vec3 facing the camera; 0 where there is none.
     """
 
     points: wp.array
@@ -40,13 +40,13 @@ class Surface:
 
     @staticmethod
     def of(points: Float64 | Float32, normals: Float64 | Float32) -> Surface:
-        """Upload (h, w, 3)."""
+        """Upload points and normals (h, w, 3)."""
         arrays = (np.ascontiguousarray(each, dtype=np.float32) for each in (points, normals))
         return Surface(*(wp.array(each, dtype=wp.vec3, device="cpu") for each in arrays))
 
 
 def frame_pyramid(depth: Float32, intrinsics: Intrinsics, levels: int) -> list[Surface]:
-    """Surfaces of a frame's depth (H, W) in metres, filtered, finest first, each half the size."""
+    """Filter depth (H, W) in metres and build a pyramid, finest first, each level half the size."""
     filtered = smooth_depth(depth, depth > 0, _SMOOTHING_M)
     made = []
     for level in range(levels):
@@ -60,16 +60,16 @@ def frame_pyramid(depth: Float32, intrinsics: Intrinsics, levels: int) -> list[S
 
 
 def model_surface(view: CastView, intrinsics: Intrinsics) -> Surface:
-    """What a view of the model shows."""
+    """Convert a view of the model to a surface."""
     return Surface.of(intrinsics.rays() * view.depth[..., None], view.normals)
 
 
 def _normals(points: Float64, valid: Any) -> Float64:
-    """Normals (h, w, 3) of a grid of points by central differences; 0 where a neighbour lacks."""
+    """Normals (h, w, 3) of a point grid by central differences; 0 if a neighbour is missing."""
     normals = np.zeros_like(points)
     across = points[1:-1, 2:] - points[1:-1, :-2]
     down = points[2:, 1:-1] - points[:-2, 1:-1]
-    found = np.cross(down, across)  # x right, y down, z forward: towards the camera
+    found = np.cross(down, across)  # x right, y down, z forward: faces the camera
     length = np.linalg.norm(found, axis=-1, keepdims=True)
     whole = valid[1:-1, 1:-1] & valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1]
     whole &= valid[:-2, 1:-1] & (length[..., 0] > 0)
@@ -93,7 +93,7 @@ def _accumulate(
     gradient: wp.array[wp.spatial_vector],
     counts: wp.array[wp.vec2],
 ) -> None:
-    """Sum the terms of one row; counts are inliers and their squared residuals."""
+    """Sum the terms of one row; ``counts`` holds inliers and their squared residuals."""
     row = wp.tid()
     H = wp.spatial_matrix()
     g = wp.spatial_vector()
@@ -123,12 +123,12 @@ def _accumulate(
 
 @dataclass(frozen=True)
 class Sums:
-    """Of one pass over a frame's points.
+    """Sums of one pass over a frame's points.
 
     Attributes:
-        H: (6, 6).
-        g: (6,).
-        inliers: points of the frame that land on one of the model, near it and turned alike.
+        H: (6, 6) Gauss-Newton matrix.
+        g: (6,) gradient.
+        inliers: number of frame points that land on a nearby model point with a similar normal.
         residual_m: RMS distance of the inliers from their planes.
     """
 
@@ -142,9 +142,9 @@ class ProjectiveICP:
     """Aligns pyramids of frames with views of the model.
 
     Args:
-        intrinsics: of the model's views.
-        iterations: at most, per level, finest first.
-        icp_threshold: length of a step (metres and radians) below which a level ends.
+        intrinsics: intrinsics of the model's views.
+        iterations: most iterations per level, finest first.
+        icp_threshold: step length (metres and radians) below which a level ends.
         distance_m: largest distance of corresponding points.
         cos_angle: least cosine of the angle between their normals.
     """
@@ -166,9 +166,9 @@ class ProjectiveICP:
         self._counts = wp.zeros(height, dtype=wp.vec2, device="cpu")
 
     def align(self, frame: list[Surface], model: Surface) -> tuple[Float64 | None, Sums]:
-        """T_model_camera (4, 4) of a frame, searched from rest, and the sums there.
+        """Align from rest; return T_model_camera (4, 4) of the frame and the sums there.
 
-        None where too few points correspond, or do not constrain the pose.
+        The pose is None if too few points correspond or they do not constrain it.
         """
         T = np.eye(4)
         for level in reversed(range(len(self.iterations))):

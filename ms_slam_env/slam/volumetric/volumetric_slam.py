@@ -1,8 +1,8 @@
-"""Volumetric SLAM with frame-to-model tracking, as a backend.
+"""The volumetric SLAM backend, with frame-to-model tracking.
 
-KinectFusion (Newcombe et al., ISMAR 2011) as Open3D's ``t.pipelines.slam`` has it: the model is
-cast from the last pose, the frame is aligned with that view, depth and intensity at once, and
-fused. While tracking is lost the pose is held and nothing is fused.
+KinectFusion (Newcombe et al., ISMAR 2011) in the variant of Open3D's ``t.pipelines.slam``: the
+model is ray-cast from the last pose, the frame is aligned with that view by depth and intensity
+together, and fused. While tracking is lost the pose is held and nothing is fused.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class FrameToModel(ABC):
 
     @abstractmethod
     def align(self, frame: DepthImage, view: CastView) -> Float64 | None:
-        """T_model_camera (4, 4) of a frame, searched from rest; None if there is none."""
+        """Align a frame with a view, starting at rest; return T_model_camera (4, 4) or None."""
 
 
 class Open3DAlignment(FrameToModel):
-    """Open3D's hybrid odometry, as in its dense SLAM: point to plane and photometric at once.
+    """Open3D's hybrid odometry, as in its dense SLAM: point-to-plane plus photometric.
 
     Its sums over pixels are rounded differently in every run, even on one thread.
     """
@@ -61,7 +61,7 @@ class Open3DAlignment(FrameToModel):
         self._start = grid.tensor(np.eye(4))
 
     def align(self, frame: DepthImage, view: CastView) -> Float64 | None:
-        """T_model_camera (4, 4) of a frame against a view of the model, None if there is none."""
+        """Align a frame with a view of the model; return T_model_camera (4, 4) or None."""
         grid = self._grid
         grey = np.repeat(frame.intensity[..., None] / np.float32(255), 3, axis=2)
         source = self._rgbd_image(grid.image(grey), grid.image(frame.depth))
@@ -85,30 +85,30 @@ class Open3DAlignment(FrameToModel):
 
 
 class OpenCVAlignment(FrameToModel):
-    """OpenCV's RGB-D odometry; the same result in every run."""
+    """OpenCV's RGB-D odometry; deterministic."""
 
     def __init__(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
         self._aligner = Aligner(intrinsics, depth_cutoff_m)
 
     def align(self, frame: DepthImage, view: CastView) -> Float64 | None:
-        """T_model_camera (4, 4) of a frame against a view of the model, None if there is none."""
+        """Align a frame with a view of the model; return T_model_camera (4, 4) or None."""
         model = self._aligner.prepare(DepthImage(view.depth, view.intensity))
         return self._aligner.align(self._aligner.prepare(frame), model)
 
 
-_FULL_WEIGHT = 3  # observations that tracking asks of the model, as soon as there are as many
+_FULL_WEIGHT = 3  # observations that tracking requires once that many frames are fused
 
 
 @dataclass(frozen=True)
 class FusedImage(DepthImage):
-    """A frame with depth beyond the cutoff taken out."""
+    """A frame without depth beyond the cutoff."""
 
     raw_depth: NDArray[np.uint16]  # (H, W) in units of 1 / DEPTH_SCALE m
     color: NDArray[np.uint8]  # (H, W, 3)
 
 
 class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
-    """The volumetric SLAM of one camera, through Open3D."""
+    """The volumetric SLAM of one camera, with Open3D."""
 
     saved = (*FrameByFrameSlam.saved, "_fused", "_grid")
     config: Any
@@ -125,7 +125,7 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
         )
 
     def _assemble(self, grid: VoxelGrid, aligner: FrameToModel) -> None:
-        """Start empty at the identity pose, with these parts and what ``config`` demands."""
+        """Start empty at the identity pose, with these parts and the settings of ``config``."""
         self._grid, self._aligner = grid, aligner
         self._judge_views(self.config.stock)
         self._fresh = True  # whether the grid is as allocated
@@ -168,7 +168,7 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
             yield self._confirmed(prepared, self._pose @ motion)
 
     def _confirmed(self, image: FusedImage, pose: Float64) -> Attempt[None]:
-        """Align with the view from a pose, then, if it may be right, with the view from there."""
+        """Align with the view from a pose; if plausible, align again with that from the result."""
         attempt = self._align(image, pose, self._cast(pose), self._thresholds.tentative)
         if attempt.reason:
             return attempt
@@ -240,7 +240,7 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
         return {"color": colors, "normal": normals}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state of a backend of the same intrinsics and configuration."""
+        """Restore the state of a backend with the same intrinsics and configuration."""
         super().set_state(state)
         self._fresh = False
         self._view = None

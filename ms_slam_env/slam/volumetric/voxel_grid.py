@@ -1,6 +1,6 @@
 """A sparse grid of signed distances: fuse frames, cast rays, extract the surface, save, restore.
 
-Curless and Levoy 1996, in blocks that a hash map finds (Niessner et al. 2013), by Open3D.
+Curless and Levoy 1996, in hashed voxel blocks (Niessner et al. 2013), with Open3D.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ STOCK: dict[str, Any] = {
     "truncation_voxels": 8.0,
     "aligner": "open3d",
 }
-"""Of Open3D's example; more iterations, a narrower truncation or association do not lower the error
-with noise."""
+"""Parameters of Open3D's example. With noise, more iterations or a narrower truncation or
+association do not lower the error."""
 
 
 @dataclass(frozen=True)
@@ -41,17 +41,17 @@ class VolumetricConfig(Checked):
         voxel_m: size of a voxel.
         block_voxels: voxels along an edge of a block; blocks are allocated near surfaces.
         blocks: blocks allocated at the start; the grid grows when they are used up.
-        truncation_voxels: the signed distance is cut off at this many voxels.
+        truncation_voxels: truncation of the signed distance, in voxels.
         depth_cutoff_m: readings beyond are ignored.
-        aligner: what aligns a frame with the model's view: ``opencv`` (the same result in every
-            run) or ``open3d`` (what Open3D's dense SLAM has; runs differ in the last digits of
-            every pose, and then by millimetres).
-        least_weight: observations after which a voxel counts as surface, in predictions and in
-            the surface points.
-        stock: Open3D's dense SLAM as it is, with the parameters of its own example
-            ``dense_slam.py`` but for ``depth_cutoff_m`` and voxels of 1 cm, whatever the others
-            say: nothing is checked, no other pose is tried, and a frame that cannot be aligned is
-            fused where the camera was last.
+        aligner: how a frame is aligned with the model's view: ``opencv`` (deterministic) or
+            ``open3d`` (as in Open3D's dense SLAM; poses differ between runs, in the last digits at
+            first and then by millimetres).
+        least_weight: observations that a voxel needs to count as surface in predictions and surface
+            points.
+        stock: unmodified Open3D dense SLAM. All other parameters are ignored except
+            ``depth_cutoff_m``: it uses those of Open3D's example ``dense_slam.py``, with voxels of
+            1 cm. Nothing is checked, no other pose is tried, and a frame that cannot be aligned is
+            fused at the last pose.
     """
 
     voxel_m: float = bounded(0.015, 0.001, 0.2)
@@ -65,20 +65,20 @@ class VolumetricConfig(Checked):
 
     @property
     def in_force(self) -> VolumetricConfig:
-        """The parameters that are used."""
+        """The effective parameters."""
         return replace(self, **STOCK) if self.stock else self
 
 
 _NEAREST_M = 0.1
-_FRAGMENT_PX = 16  # edge of the pieces in which Open3D draws its blocks
+_FRAGMENT_PX = 16  # edge of the fragments in which Open3D draws its blocks
 _SMOOTH_PX = 1.5  # width of the filter of cast depth
 
 
 def load_open3d(what: str = "the volumetric backend") -> Any:
-    """Open3D, which ``what`` needs, its messages below errors silenced.
+    """Import Open3D for ``what``, with messages below errors silenced.
 
     Raises:
-        InputError: it, or a system library that it needs, is not installed.
+        InputError: Open3D or a system library that it needs is not installed.
     """
     try:
         import open3d
@@ -91,18 +91,18 @@ def load_open3d(what: str = "the volumetric backend") -> Any:
     return open3d
 
 
-_FARTHEST_M = 1e4  # of a block in a state; rays are cast from farther than all blocks
+_FARTHEST_M = 1e4  # limit for blocks in a state; rays are cast from beyond all blocks
 DEPTH_SCALE = 5000.0  # 16-bit depth of 0.2 mm, well below the sensor's noise
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
 
 @dataclass(frozen=True)
 class CastView:
-    """An image cast from the grid."""
+    """An image ray-cast from the grid."""
 
     depth: Float32  # (H, W) float32 metres; 0 where the grid is empty
     color: Float32  # (H, W, 3) float32 RGB in [0, 1]
-    # (H, W, 3) float32 unit vectors in the camera frame, towards the camera; 0 where empty.
+    # (H, W, 3) float32 unit vectors in the camera frame, facing the camera; 0 where empty.
     normals: Float32
 
     @property
@@ -114,8 +114,8 @@ class CastView:
 class VoxelGrid(Stateful):
     """The map of one camera."""
 
-    # Open3D finds a voxel's reading by cutting off the fraction of its pixel: with centres at
-    # integers that is half a pixel too low.
+    # Open3D truncates a voxel's pixel coordinates to integers. With pixel centres at integers that
+    # is half a pixel too low.
     _reading_shift_px = 0.5
 
     def __init__(self, intrinsics: Intrinsics, config: VolumetricConfig) -> None:
@@ -144,11 +144,11 @@ class VoxelGrid(Stateful):
         self._surface: tuple[Float64, NDArray[np.uint8], Float32] | None = None
 
     def tensor(self, array: NDArray[Any]) -> Any:
-        """Open3D's view of an array."""
+        """Wrap an array as an Open3D tensor."""
         return self.open3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
 
     def image(self, array: NDArray[Any]) -> Any:
-        """Open3D's image of an array (H, W) or (H, W, C)."""
+        """Wrap an array (H, W) or (H, W, C) as an Open3D image."""
         full = array if array.ndim == 3 else array[..., None]
         return self.open3d.t.geometry.Image(self.tensor(full))
 
@@ -162,7 +162,7 @@ class VoxelGrid(Stateful):
             blocks = self._grid.compute_unique_block_coordinates(
                 depth_image, camera, extrinsic, *limits
             )
-        except RuntimeError as error:  # of the few pixels that it looks at none is within reach
+        except RuntimeError as error:  # none of the few pixels that it samples is in range
             if "No block is touched" not in str(error):
                 raise
             return
@@ -175,14 +175,14 @@ class VoxelGrid(Stateful):
         if self._block_keys() is None:
             return _nothing(intrinsics)
         self._reserve_fragments(intrinsics)
-        # Open3D looks distances up at the voxel below a point, on average half a voxel off along
-        # each axis, and interpolates colours and normals at the right place.
+        # Open3D looks up distances at the voxel below a point, on average half a voxel off along
+        # each axis, but interpolates colours and normals at the right position.
         moved = pose.copy()
         moved[:3, 3] += self.config.voxel_m / 2
         distance = self._ray_cast(moved, least_weight, intrinsics, ["depth"])["depth"]
         found = self._ray_cast(pose, least_weight, intrinsics, ["color", "normal"])
         depth = distance.numpy()[..., 0] / np.float32(DEPTH_SCALE)
-        normals = -found["normal"].numpy()  # Open3D's point away from the camera
+        normals = -found["normal"].numpy()  # Open3D's normals point away from the camera
         hit = (depth > 0) & (np.linalg.norm(normals, axis=-1) > 0.5)
         return CastView(
             depth=np.where(hit, smooth_depth(depth, hit, self.config.voxel_m), np.float32(0)),
@@ -193,7 +193,7 @@ class VoxelGrid(Stateful):
     def _ray_cast(
         self, pose: Float64, least_weight: float, intrinsics: Intrinsics, names: list[str]
     ) -> Any:
-        """Open3D's ray cast of the images ``names``, (H, W, channels) tensors."""
+        """Ray-cast the images ``names`` with Open3D, as tensors (H, W, channels)."""
         limits = self.config.depth_cutoff_m, least_weight, range_factor(intrinsics)
         return self._ray_cast_blocks(self._keys, pose, intrinsics, names, *limits)
 
@@ -209,12 +209,12 @@ class VoxelGrid(Stateful):
     ) -> Any:
         extrinsic, size = self.tensor(invert(pose)), (intrinsics.width, intrinsics.height)
         range_m = DEPTH_SCALE, _NEAREST_M, farthest_m
-        rule = least_weight - 0.5, self.config.truncation_voxels, factor  # compared strictly
+        rule = least_weight - 0.5, self.config.truncation_voxels, factor  # Open3D compares strictly
         camera = camera_matrix(self, intrinsics)
         return self._grid.ray_cast(keys, camera, extrinsic, *size, names, *range_m, *rule)
 
     def _block_keys(self) -> Any:
-        """Coordinates (M, 3) of all blocks as a tensor, None if there are none."""
+        """Tensor (M, 3) of all block coordinates; None if there are none."""
         hashmap = self._grid.hashmap()
         if self._keys is None and hashmap.size() > 0:
             used = hashmap.active_buf_indices().to(self.open3d.core.int64)
@@ -222,11 +222,11 @@ class VoxelGrid(Stateful):
         return self._keys
 
     def _reserve_fragments(self, intrinsics: Intrinsics) -> None:
-        """Make room for all pieces of blocks that a ray cast draws to bound its rays.
+        """Reserve room for all block fragments that a ray cast draws to bound its rays.
 
-        Open3D starts with room for about a hundred, and a cast that needs more leaves out the
-        others before it makes room, for the next cast. A cast of no interest, from far away with
-        every block in sight several times, keeps that from ours.
+        Open3D starts with room for about a hundred. A cast that needs more omits the rest, and
+        makes room only for the next cast. A dummy cast from far away, with every block in view
+        several times, avoids that.
         """
         factor = range_factor(intrinsics)
         pieces = math.ceil(intrinsics.width / factor / _FRAGMENT_PX) * math.ceil(
@@ -250,7 +250,7 @@ class VoxelGrid(Stateful):
     def surface(self) -> tuple[Float64, NDArray[np.uint8], Float32]:
         """Points (M, 3) metres, colours (M, 3) RGB and normals (M, 3) of the zero crossings.
 
-        Sorted by position: Open3D finds them in an order that changes from run to run.
+        Sorted by position, because Open3D's order changes from run to run.
         """
         if self._surface is None:
             self._surface = self._extract_surface()
@@ -269,7 +269,7 @@ class VoxelGrid(Stateful):
         return nothing, nothing.astype(np.uint8), nothing.astype(np.float32)
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Coordinates of the blocks and what their voxels hold."""
+        """Block coordinates and voxel contents."""
         hashmap = self._grid.hashmap()
         used = hashmap.active_buf_indices().numpy().astype(np.int64)
         keys = hashmap.key_tensor().numpy()[used]
@@ -287,7 +287,7 @@ class VoxelGrid(Stateful):
         return like | {"keys": replace(like["keys"], least=-most, most=most)}
 
     def set_state(self, state: dict[str, NDArray[Any]]) -> None:
-        """Go on from a state of a grid of the same configuration."""
+        """Restore the state of a grid with the same configuration."""
         self.clear()
         if len(state["keys"]) == 0:
             return
@@ -304,7 +304,7 @@ class VoxelGrid(Stateful):
 
 
 class StockVoxelGrid(VoxelGrid):
-    """The grid as Open3D's ``t.pipelines.slam.Model`` has it: nothing is corrected."""
+    """The grid of Open3D's ``t.pipelines.slam.Model``, without corrections."""
 
     _reading_shift_px = 0.0
 
@@ -327,22 +327,21 @@ def _nothing(intrinsics: Intrinsics) -> CastView:
 
 
 def smooth_depth(depth: Float32, hit: NDArray[np.bool_], voxel_m: float) -> Float32:
-    """Take the steps of fractions of a voxel out of a depth image (H, W); edges stay."""
-    filled = np.where(hit, depth, np.float32(-100.0))  # far from every surface: of no weight
+    """Smooth subvoxel steps in a depth image (H, W); edges stay."""
+    filled = np.where(hit, depth, np.float32(-100.0))  # far from every surface, so without weight
     return np.asarray(cv2.bilateralFilter(filled, 5, voxel_m, _SMOOTH_PX), dtype=np.float32)
 
 
 def camera_matrix(grid: VoxelGrid, intrinsics: Intrinsics, shift_px: float = 0.0) -> Any:
-    """Camera matrix (3, 3) as a tensor, its centre shifted by some pixels."""
+    """Camera matrix (3, 3) as a tensor, with its centre shifted by ``shift_px``."""
     matrix = intrinsics.matrix
     matrix[:2, 2] += shift_px
     return grid.tensor(matrix)
 
 
 def range_factor(intrinsics: Intrinsics) -> int:
-    """Pixels of the image along a pixel of Open3D's map of ray bounds.
+    """Downsampling factor of Open3D's ray range map.
 
-    It must divide the image's size: with a remainder Open3D reads beyond that map, and a cast may
-    take for ever.
+    It must divide the image size; otherwise Open3D reads beyond that map, and a cast may never end.
     """
     return math.gcd(8, intrinsics.width, intrinsics.height)
