@@ -25,7 +25,12 @@ from ms_slam_env.slam.shared.alignment_check import (
     status_on_appeal,
 )
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
-from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds, is_nearly_accepted
+from ms_slam_env.slam.surfel.acceptance import (
+    Alignment,
+    acceptance_thresholds,
+    fit_of_noise,
+    is_nearly_accepted,
+)
 from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.submaps import FrameLookup
 
@@ -176,7 +181,8 @@ def judge(
     features |= {f"view {name}": float(getattr(view, name)) for name in VIEW_FEATURES}
     status = first_status(alignment, slam.config)
     on_appeal = status
-    if status in DISPUTED and is_nearly_accepted(alignment, 0, slam.config.acceptance):
+    acceptance, noise = slam.config.acceptance, fit_of_noise(1)
+    if status in DISPUTED and is_nearly_accepted(alignment, 0, acceptance, noise):
         on_appeal = status_on_appeal(view)
     accepted = {
         THRESHOLDS: status == TrackingStatus.OK,

@@ -19,6 +19,20 @@ from ms_slam_env.env.wrappers import Perturbed
 from ms_slam_env.errors import InputError
 
 OPTIONS = {"scene": "table", "scene_seed": 0, "image_size": "80x60"}
+
+
+def _negative(value):
+    if not isinstance(value, np.ndarray):
+        return -1
+    if value.dtype.names:
+        fields = {name: _negative(value[name]) for name in value.dtype.names}
+        whole = np.empty_like(value)
+        for name, field in fields.items():
+            whole[name] = field
+        return whole
+    return ~value if value.dtype.kind == "b" else -np.ones_like(value)
+
+
 MUTATIONS = {
     "gone": lambda value: KeyError,
     "none": lambda value: None,
@@ -26,7 +40,7 @@ MUTATIONS = {
     "number": lambda value: 7.5,
     "object": lambda value: object(),
     "empty list": lambda value: [],
-    "negative": lambda value: -np.ones_like(value) if isinstance(value, np.ndarray) else -1,
+    "negative": lambda value: _negative(value),
     "huge": lambda value: value + 10**9 if isinstance(value, int) else 10**400,
     "nan": lambda value: _filled(value, np.nan),
     "infinite": lambda value: _filled(value, -np.inf),

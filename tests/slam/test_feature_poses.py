@@ -8,10 +8,19 @@ from box_scene import BoxScene
 
 from ms_slam_env import slam
 from ms_slam_env.camera import RGBDFrame, xtion
-from ms_slam_env.geometry import invert, look_at, make_pose, relative_angle, so3_exp
+from ms_slam_env.geometry import (
+    invert,
+    look_at,
+    make_pose,
+    relative_angle,
+    se3_log,
+    so3_exp,
+    transform_points,
+)
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.shared import feature_poses
 from ms_slam_env.slam.shared.feature_poses import KeyframeImages, LastFrames
+from ms_slam_env.slam.shared.point_poses import Sightings, refine_pose, sighting_covariance
 from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization
 
 CAMERA = xtion("160x120")
@@ -48,6 +57,47 @@ def test_features_find_a_motion_of_many_frames(sensor, start):
     assert support.is_strong
     again = _kept(before, start).find(0, after.color, after.depth, 8.0)
     np.testing.assert_array_equal(pose, again[0])
+
+
+def test_the_covariance_is_that_of_independent_noise(sensor, start):
+    """Sightings with the noise that they say they have scatter poses as the covariance says."""
+    rng = np.random.default_rng(0)
+    truth = start @ TURN
+    points = start[:3, 3] + rng.uniform(0.8, 3.0, (80, 1)) * (
+        CAMERA.rays_at(rng.uniform([0, 0], [159, 119], (80, 2))) @ truth[:3, :3].T
+    )
+    seen = transform_points(invert(truth), points)
+    pixels = seen[:, :2] / seen[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
+    sigma_px, sigma_inverse_depth = np.full(80, 0.5), 0.004
+    twists = []
+    for _ in range(300):
+        noisy = Sightings(
+            pixels + rng.normal(0, 0.5, pixels.shape),
+            1 / seen[:, 2] + rng.normal(0, sigma_inverse_depth, 80),
+            sigma_px,
+            sigma_inverse_depth,
+        )
+        T, _ = refine_pose(truth, points, noisy, CAMERA, rounds=1)
+        twists.append(se3_log(invert(truth) @ T))
+    predicted = sighting_covariance(truth, points, noisy, CAMERA)
+    measured = np.cov(np.array(twists).T)
+    # 300 draws know a standard deviation to 4 %; Huber's weights add a little.
+    np.testing.assert_allclose(np.sqrt(np.diag(measured) / np.diag(predicted)), 1, atol=0.2)
+    whitened = np.linalg.solve(np.linalg.cholesky(predicted), np.array(twists).T)
+    assert 5.0 < np.mean((whitened**2).sum(axis=0)) < 8.0  # chi squared of six
+
+
+def test_features_are_the_same_whether_they_were_sought_before_or_not(sensor, start):
+    frames = [sensor.capture(start @ np.linalg.matrix_power(TURN, k), k) for k in range(3)]
+    chain = _kept(frames[0], start)
+    for k in (1, 2):
+        again = _kept(frames[k - 1], start).find(0, frames[k].color, frames[k].depth, 8.0)
+        found = chain.find(0, frames[k].color, frames[k].depth, 8.0)
+        assert (found is None) == (again is None)
+        if found is not None:
+            np.testing.assert_array_equal(found[0], again[0])
+        images = frames[k].color[None], frames[k].depth[None]
+        chain.keep(*images, start[None], np.ones(1, dtype=bool))
 
 
 def test_another_place_has_no_strong_support(sensor, start):

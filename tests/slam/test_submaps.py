@@ -163,6 +163,22 @@ def test_without_a_loss_every_bit_is_as_without_submaps(frames):
     assert not len(on.corrected_trajectory()[0])
 
 
+def test_frames_that_stay_out_of_the_map_start_another_where_features_put_them(frames):
+    """No alignment can meet these rules, so that only features speak for the poses."""
+    rules = {"overlap": 1.0}
+    smooth = frames[JUMP : JUMP + 5]
+    backend, results = _run(smooth, PATH[JUMP], acceptance=rules)
+    assert [result.submap for result in results] == [0, 0, 0, 1, 1]
+    assert [result.uncertain for result in results[:4]] == [False, True, True, False]
+    for result, pose in zip(results, PATH[JUMP:], strict=False):
+        assert np.linalg.norm(result.T_world_camera[:3, 3] - pose[:3, 3]) < 0.02
+    doubt = [np.trace(result.covariance[:3, :3]) for result in results[1:]]
+    assert doubt[1] > 1.5 * doubt[0]
+    assert doubt[2] > doubt[1]  # of the submap's start
+    link = backend.submaps().links[1]
+    assert np.sqrt(np.trace(link[:3, :3])) >= 0.03 * np.sqrt(9) - 1e-9
+
+
 def test_off_stands_still(frames):
     backend, results = _run(frames[: JUMP + 8], submaps="off")
     held = results[JUMP - 1].T_world_camera

@@ -13,7 +13,12 @@ from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.shared.feature_matching import match_anywhere
 from ms_slam_env.slam.shared.orb_features import FeatureExtractor, Features, InverseDepth
-from ms_slam_env.slam.shared.point_poses import Sightings, pose_from_matches, refine_pose
+from ms_slam_env.slam.shared.point_poses import (
+    Sightings,
+    pose_from_matches,
+    refine_pose,
+    sighting_covariance,
+)
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import ListOf, WholeNumber
 
@@ -21,8 +26,8 @@ _HAMMING = 60  # largest distance of matching descriptors, bits of 256
 _ERROR_PX = 2.5  # largest reprojection error of a RANSAC inlier
 _PIXEL_NOISE = 0.7  # position noise of a corner of the finest level, as in ``sparse_config``
 _INVERSE_DEPTH_NOISE = 0.004  # 1/m
-STRONG_SUPPORT = 30  # matches that a strongly supported pose explains
-WIDE_SPREAD = 0.1  # least standard deviation of their positions, share of the image, per axis
+STRONG_SUPPORT = 30  # matches that a pose which can stand alone explains
+STRONG_SIGMA_M = 0.03  # largest standard deviation of its position, by the noise of corners
 
 
 @dataclass(frozen=True)
@@ -31,12 +36,13 @@ class FeaturePose:
 
     T_reference_frame: Float64  # (4, 4)
     inliers: int  # matches that it explains, in the image and in depth
-    spread: float  # the smaller standard deviation of their positions, share of the image's size
+    covariance: Float64  # (6, 6) of the twist (rho, phi), T_reference_frame exp(twist)
 
     @property
     def is_strong(self) -> bool:
         """Whether its support suffices without other evidence."""
-        return self.inliers >= STRONG_SUPPORT and self.spread >= WIDE_SPREAD
+        sigma_m = np.sqrt(np.trace(self.covariance[:3, :3]))
+        return self.inliers >= STRONG_SUPPORT and bool(sigma_m <= STRONG_SIGMA_M)
 
 
 def pose_from_features(
@@ -60,9 +66,9 @@ def pose_from_features(
     T, inlier = refine_pose(found[0], points, sightings, intrinsics)
     if not inlier.any():
         return None
-    size = np.array([intrinsics.width, intrinsics.height])
-    spread = float((seen.pixels[inlier].std(axis=0) / size).min())
-    return FeaturePose(T, int(inlier.sum()), spread)
+    used = np.flatnonzero(inlier)
+    covariance = sighting_covariance(T, points[used], sightings.chosen(used), intrinsics)
+    return FeaturePose(T, int(inlier.sum()), covariance)
 
 
 class FrameFeatures:
@@ -159,6 +165,8 @@ class LastFrames(Saved):
     def use(self, intrinsics: Intrinsics) -> None:
         """Switch to a camera; stored frames of another size are dropped."""
         self._frames = FrameFeatures(intrinsics)
+        self._known: dict[int, Features] = {}  # of the last frames
+        self._seen: dict[int, tuple[NDArray[np.uint8], Features]] = {}  # of frames asked for since
         size = (len(self._poses), *intrinsics.shape)
         if self._depth.shape != size:
             self._poses[:] = np.nan
@@ -173,9 +181,13 @@ class LastFrames(Saved):
         known: NDArray[np.bool_],
     ) -> None:
         """Store the frames (B, H, W) of the envs whose poses (B, 4, 4) are ``known`` (B,)."""
-        for own, new in ((self._color, color), (self._depth, depth), (self._poses, T_world_camera)):
-            for env in np.flatnonzero(known):
-                own[env] = new[env]
+        for env in map(int, np.flatnonzero(known)):
+            self._color[env], self._depth[env] = color[env], depth[env]
+            self._poses[env] = T_world_camera[env]
+            self._known.pop(env, None)
+            if env in self._seen and np.array_equal(self._seen[env][0], color[env]):
+                self._known[env] = self._seen[env][1]
+        self._seen = {}
 
     @property
     def images(self) -> tuple[NDArray[np.uint8], Float32]:
@@ -189,6 +201,12 @@ class LastFrames(Saved):
     def forget(self, env: int) -> None:
         """Drop an env's frame."""
         self._poses[env] = np.nan
+        self._known.pop(env, None)
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state; features are sought anew."""
+        super().set_state(state)
+        self._known, self._seen = {}, {}
 
     def find(
         self, env: int, color: NDArray[np.uint8], depth: Float32, cutoff_m: float
@@ -197,6 +215,10 @@ class LastFrames(Saved):
         if not np.isfinite(self._poses[env, 0, 0]):
             return None
         of = self._frames.features_of
-        before, now = of(self._color[env], self._depth[env], cutoff_m), of(color, depth, cutoff_m)
+        if env not in self._known:
+            self._known[env] = of(self._color[env], self._depth[env], cutoff_m)
+        if env not in self._seen or not np.array_equal(self._seen[env][0], color):
+            self._seen[env] = color, of(color, depth, cutoff_m)
+        before, now = self._known[env], self._seen[env][1]
         found = pose_from_features(before, now, self._frames.intrinsics)
         return None if found is None else (self._poses[env] @ found.T_reference_frame, found)

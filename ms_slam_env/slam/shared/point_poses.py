@@ -104,24 +104,40 @@ def refine_pose(
     return orthonormal(invert(T)), inlier
 
 
+def sighting_covariance(
+    T_world_camera: Float64, points: Float64, seen: Sightings, intrinsics: Intrinsics
+) -> Float64:
+    """Covariance (6, 6) of a pose that explains sightings, of the twist T_world_camera exp(xi)."""
+    p = transform_points(invert(T_world_camera), points)
+    A = _pose_jacobian(residual_jacobian(p, seen, intrinsics), p)
+    return np.asarray(np.linalg.inv(A.T @ A + _DAMPING), dtype=np.float64)
+
+
+def _pose_jacobian(by_point: Float64, p: Float64) -> Float64:
+    """Derivatives (3N, 6) with respect to a twist of the camera; ``by_point`` (N, 3, 3) and ``p``.
+
+    d(p) / d(phi) = -hat(p)
+    """
+    x, y, z = p.T[:, :, None]
+    J = np.empty((len(p), 3, 6))
+    J[:, :, :3] = by_point
+    J[:, :, 3] = J[:, :, 2] * y - J[:, :, 1] * z
+    J[:, :, 4] = J[:, :, 0] * z - J[:, :, 2] * x
+    J[:, :, 5] = J[:, :, 1] * x - J[:, :, 0] * y
+    return J.reshape(-1, 6)
+
+
 def _gauss_newton(
     T: Float64, points: Float64, seen: Sightings, limit: Float64, intrinsics: Intrinsics
 ) -> Float64:
     """Refine ``T`` in a few steps; return T_camera_world (4, 4)."""
-    J = np.empty((len(points), 3, 6))
     for _ in range(_ITERATIONS):
         r, p = residuals(T, points, seen, intrinsics)
         if not np.isfinite(r).all():
             break
         squares = np.einsum("nk,nk->n", r, r)
         weight = np.sqrt(np.minimum(1.0, np.sqrt(limit / np.maximum(squares, 1e-12))))
-        x, y, z = p.T[:, :, None]
-        J[:, :, :3] = residual_jacobian(p, seen, intrinsics) * weight[:, None, None]
-        # d(p) / d(phi) = -hat(p)
-        J[:, :, 3] = J[:, :, 2] * y - J[:, :, 1] * z
-        J[:, :, 4] = J[:, :, 0] * z - J[:, :, 2] * x
-        J[:, :, 5] = J[:, :, 1] * x - J[:, :, 0] * y
-        A = J.reshape(-1, 6)
+        A = _pose_jacobian(residual_jacobian(p, seen, intrinsics) * weight[:, None, None], p)
         H = A.T @ A + _DAMPING
         step = np.linalg.solve(H, -A.T @ (r * weight[:, None]).ravel())
         T = make_pose(cv2.Rodrigues(step[3:])[0], step[:3]) @ T

@@ -158,6 +158,7 @@ def assess_alignment(
     statistics[b] = found
 
 
+_RATIOS = ("inlier_ratio", "photometric_inlier_ratio")
 LARGEST_SIGMA = 0.04  # (metres, radians) of the worst direction that the view constrains
 
 
@@ -206,6 +207,42 @@ _STRICT = {
     "depth_conflict_ratio": 0.12,
     "cost": 1.3,
 }
+
+
+USUAL = np.dtype([(name, np.float64) for name in ("cost", *_RATIOS)])
+"""What alignments are like that were accepted of late: of a recording's own noise."""
+_FOLLOWS = 0.1  # share of the way from what is usual to the last frame
+_EXPECTED = {"cost": 1.05, "inlier_ratio": 0.9, "photometric_inlier_ratio": 0.85}
+_LARGEST_COST, _SMALLEST_RATIO = 1.9, 0.5  # that noise makes acceptable
+
+
+def fit_of_noise(batch: int) -> NDArray[Any]:
+    """What is usual (B,) with the noise that ``SurfelConfig`` expects."""
+    return np.full(batch, 1.0).astype(USUAL)
+
+
+def follow_usual(usual: np.void, statistics: np.void) -> None:
+    """Learn, in place, from a frame that was accepted."""
+    for name in USUAL.names or ():
+        usual[name] += _FOLLOWS * (float(statistics[name]) - usual[name])
+
+
+def at_usual_noise(thresholds: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any]:
+    """Thresholds (B,) for recordings that usually fit as ``usual`` (B,) says.
+
+    Those of ``acceptance_thresholds`` suit the noise of a rendered Kinect, of which ``_EXPECTED``
+    holds the worst that is usual. A HoloLens, or a real Kinect, has a cost of 1.2 to 1.3: what is
+    demanded of it is less by the difference.
+    """
+    relaxed = thresholds.copy()
+    excess = np.maximum(usual["cost"] - _EXPECTED["cost"], 0.0)
+    most = np.maximum(thresholds["cost"], _LARGEST_COST)
+    relaxed["cost"] = np.minimum(thresholds["cost"] + excess, most)
+    for name in _RATIOS:
+        lack = np.maximum(_EXPECTED[name] - usual[name], 0.0)
+        least = np.minimum(thresholds[name], _SMALLEST_RATIO)
+        relaxed[name] = np.maximum(thresholds[name] - lack, least)
+    return relaxed
 
 
 def geometric_thresholds(config: AcceptanceConfig, lost: NDArray[np.int32]) -> NDArray[Any]:
@@ -276,11 +313,16 @@ class Alignment:
 
 
 DOUBT_M, DOUBT_RAD = 0.03, 0.02
-"""Standard deviations that doubt adds to a pose, per axis."""
+"""Standard deviations that a frame in doubt adds to a pose, per axis."""
 
 
-def is_nearly_accepted(alignment: Alignment, env: int, config: AcceptanceConfig) -> bool:
-    """Whether a refused alignment deserves a closer look: by somewhat laxer thresholds."""
+def is_nearly_accepted(
+    alignment: Alignment, env: int, config: AcceptanceConfig, usual: NDArray[Any]
+) -> bool:
+    """Whether a refused alignment deserves a closer look: by somewhat laxer thresholds.
+
+    ``usual`` (1,) is what alignments of the env are like.
+    """
     doubted = config.doubted
     thresholds = AcceptanceThresholds(
         matches=config.points,
@@ -291,12 +333,13 @@ def is_nearly_accepted(alignment: Alignment, env: int, config: AcceptanceConfig)
         cost=max(doubted.cost, config.cost),
         sigma_m=LARGEST_SIGMA,
     )
-    return alignment.status_under(thresholds, env) == TrackingStatus.OK
+    relaxed = AcceptanceThresholds(*at_usual_noise(thresholds.repeated(1), usual)[0].tolist())
+    return alignment.status_under(relaxed, env) == TrackingStatus.OK
 
 
-def with_doubt(covariance: Float64) -> Float64:
-    """Covariance (6, 6) of a pose that is uncertain."""
-    return covariance + np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
+def with_doubt(covariance: Float64, frames: int = 1) -> Float64:
+    """Covariance (6, 6) of a pose that has been uncertain for a number of frames."""
+    return covariance + frames * np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
 
 
 def accept_any_fit(alignment: Alignment) -> Alignment:

@@ -57,7 +57,8 @@ class SurfelSlam(SlamBackend):
                 parameters that it was made with, and ferns the depths that they ask for.
             image_size: (width, height) that frames are reduced to before anything else; None for
                 the size they have. ``track`` takes frames of the camera's own size all the same,
-                and ``predict`` renders views of it.
+                and ``predict`` renders views of it. With another size the motion mask, and the
+                features of the last frame, start anew.
 
         Raises:
             InputError: a change of what must stay, or a size that the camera's frames cannot be

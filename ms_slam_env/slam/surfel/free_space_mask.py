@@ -346,6 +346,10 @@ class MotionMask(Saved):
         """Every n-th row and column (h, w) of an env's mask; None if nothing is ever masked."""
         return None
 
+    def still(self, depth: Float32) -> Float32:
+        """Depth images (B, H, W) without the readings of what moves."""
+        return depth
+
 
 INTERVAL = 4  # frames between two that are remembered
 NEW = 3  # of the earlier frames; slow things have hardly moved since
@@ -632,6 +636,15 @@ class GeometricMotionMask(MotionMask):
     def mask(self, env: int) -> Bool | None:
         """See the base class."""
         return self._masked.read()[env] > 0
+
+    def still(self, depth: Float32) -> Float32:
+        """See the base class."""
+        masked = self._masked.read() > 0
+        if not masked.any():
+            return depth
+        step = -(-depth.shape[1] // masked.shape[1])
+        whole = masked.repeat(step, axis=1).repeat(step, axis=2)
+        return np.where(whole[:, : depth.shape[1], : depth.shape[2]], np.float32(0), depth)
 
 
 def _flat(*buffers: SavedBuffer) -> list[wp.array]:

@@ -6,6 +6,7 @@ searches for those that are not found near the expected pose.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,9 @@ from ms_slam_env.slam.surfel.acceptance import (
     Alignment,
     accept_any_fit,
     acceptance_thresholds,
+    at_usual_noise,
+    fit_of_noise,
+    follow_usual,
     geometric_thresholds,
     is_nearly_accepted,
 )
@@ -46,6 +50,7 @@ from ms_slam_env.slam.surfel.pose_hypotheses import (
     NUM_HYPOTHESES,
     UNMOVED,
     damped,
+    is_within,
     relocalization_hypotheses,
     tracking_hypotheses,
 )
@@ -68,6 +73,8 @@ class CameraStates(Stateful):
         lost: (B,) frames since tracking was lost.
         time: (B,) frames taken.
         doubted: (B,) frames in a row whose pose is uncertain.
+        usual: (B,) cost and shares of inliers of the alignments that were accepted of late,
+            ``UsualFit`` each.
     """
 
     poses: Float64
@@ -77,6 +84,7 @@ class CameraStates(Stateful):
     lost: NDArray[np.int32]
     time: NDArray[np.int32]
     doubted: NDArray[np.int32]
+    usual: NDArray[Any]
 
     def __init__(self, batch: int) -> None:
         """Cameras at the identity pose that have seen nothing."""
@@ -84,6 +92,7 @@ class CameraStates(Stateful):
         own: dict[str, NDArray[Any]] = {"poses": identity, "motions": identity.copy()}
         own |= {"photometry": same_exposure(batch), "started": np.zeros(batch, dtype=bool)}
         own |= {name: zeros.copy() for name in ("lost", "time", "doubted")}
+        own["usual"] = fit_of_noise(batch)
         self._own = own
         for name, array in own.items():
             shown = array.view()
@@ -112,6 +121,8 @@ class CameraStates(Stateful):
         own["motions"][env] = damped(motion) if is_degenerate else motion
         own["lost"][env] = 0
         own["doubted"][env] = self.doubted[env] + 1 if alignment.uncertain[env] else 0
+        if alignment.tracked[env]:
+            follow_usual(own["usual"][env], alignment.statistics[env])
         own["photometry"][env] = next_photometry(
             self.photometry[env],
             alignment.photometry[env],
@@ -134,8 +145,10 @@ class CameraStates(Stateful):
         self._own["poses"][env] = pose
 
     def forget_exposure(self, env: int) -> None:
-        """Take an env's next frame to be exposed like the map."""
+        """Take an env's next frame to be exposed like the map; what its noise is stays known."""
+        reference = self.photometry[env]["reference"]
         self._own["photometry"][env] = same_exposure(1)[0]
+        self._own["photometry"][env]["reference"] = reference
 
     def count(self, frames: int = 1) -> None:
         """Count frames of every env; -1 takes the last one back."""
@@ -200,10 +213,11 @@ class MapAligner:
 
     def align_strictly(self, origins: Float64, hypotheses: Float64) -> Alignment:
         """The same under strict thresholds, of alignments that a wide search leads to."""
-        config, lost = self._config.acceptance, self._states.lost
-        return self.align_from(
-            origins, hypotheses, acceptance_thresholds(config, self._strict, lost)
-        )
+        return self.align_from(origins, hypotheses, self._thresholds(self._strict))
+
+    def _thresholds(self, strict: NDArray[np.bool_]) -> NDArray[Any]:
+        """What is demanded (B,) of alignments, ``strict`` (B,) or ordinary."""
+        return acceptance_thresholds(self._config.acceptance, strict, self._states.lost)
 
     def track(self, invalid: NDArray[np.bool_], guesses: Float64 | None) -> Alignment:
         """Align with the views from the last poses; a lost env searches wider at every frame."""
@@ -217,7 +231,7 @@ class MapAligner:
                 for motion, frames_lost in zip(states.motions, states.lost, strict=True)
             ]
         )
-        thresholds = acceptance_thresholds(self._config.acceptance, lost, states.lost)
+        thresholds = self._thresholds(lost)
         alignment = self._align(states.poses, hypotheses, thresholds, states.photometry, guesses)
         alignment = alignment.with_status(invalid, TrackingStatus.BLANK)
         return self._without_color(hypotheses, alignment)
@@ -228,9 +242,10 @@ class MapAligner:
         ``starts`` (B, 4, 4) are T_model_live.
         """
         states = self._states
-        thresholds = acceptance_thresholds(self._config.acceptance, states.lost > 0, states.lost)
+        thresholds = self._thresholds(states.lost > 0)
         view = self._view_from(states.poses)
-        return self._tracker.refine(view, states.poses, starts, thresholds, states.photometry)
+        relaxed = at_usual_noise(thresholds, states.usual)
+        return self._tracker.refine(view, states.poses, starts, relaxed, states.photometry)
 
     def _without_color(self, hypotheses: Float64, alignment: Alignment) -> Alignment:
         """Align the envs whose grey values do not fit by geometry alone, from the nearest poses.
@@ -254,7 +269,7 @@ class MapAligner:
         states = self._states
         starts = np.where(where[:, None, None], alignment.T_model_live, np.eye(4))
         hypotheses = np.repeat(starts[:, None], NUM_HYPOTHESES, axis=1)
-        thresholds = acceptance_thresholds(self._config.acceptance, states.lost > 0, states.lost)
+        thresholds = self._thresholds(states.lost > 0)
         again = self.align_from(states.poses, hypotheses, thresholds)
         return alignment.replace(where & again.tracked, again)
 
@@ -266,8 +281,10 @@ class MapAligner:
         photometry: NDArray[Any],
         guesses: Float64 | None = None,
     ) -> Alignment:
+        """Align with the views from ``origins``, judged by the noise that recordings have shown."""
         view = self._view_from(origins)
-        return self._tracker.align(view, origins, hypotheses, thresholds, guesses, photometry)
+        relaxed = at_usual_noise(thresholds, self._states.usual)
+        return self._tracker.align(view, origins, hypotheses, relaxed, guesses, photometry)
 
     def _view_from(self, origins: Float64) -> ModelView:
         """The maps from ``origins`` (B, 4, 4), but what moves."""
@@ -280,11 +297,14 @@ class MapAligner:
 MOSTLY_MOVING = 0.6  # share of the readings: rather the pose is wrong, or too little is left
 CLEARLY_APART = 30.0  # squared Mahalanobis distance; below 20 where nothing leads a pose
 APART_M, APART_RAD = (0.006, 0.1), np.radians((0.4, 6.0))  # more than noise, less than a jump
+QUESTIONED = 0.15  # above the usual cost, from which an alignment is questioned
 MENDED = 0.9  # of the cost of an alignment that may have slipped
+AGREED = 1.01  # of that cost, where many features all over the image speak for the other
 # Of the cost of one that left a direction open, in which it is no judge: of 36 such frames of
 # validation seeds for which features led to an alignment it takes 34, 30 nearer, 2 farther.
 AS_GOOD = 1.5
-LONGEST_DOUBT = 10  # frames in a row that may be uncertain; after them tracking is lost
+FARTHEST = 0.3, np.radians(30.0)  # motion of a frame that features alone speak for
+LONGEST_DOUBT = 10  # frames in a row that the map may leave uncertain
 RETRIES = 2  # further searches within a frame whose tracking failed
 
 
@@ -310,6 +330,7 @@ class Localizer:
         self._aligner = aligner
         self._relocalization = relocalization
         self._motion_mask = motion_mask
+        self._feature_poses: dict[int, tuple[Float64, FeaturePose] | None] = {}  # of the frame
 
     def use(self, pipeline: Pipeline) -> None:
         """Look at frames in this way from now on."""
@@ -325,13 +346,20 @@ class Localizer:
         self._aligner.set_frame(live)
         states = self._states
         expected = states.poses @ states.motions
+        if guesses is not None:
+            is_guessed = np.isfinite(guesses[:, :1, :1])
+            expected = np.where(is_guessed, guesses, expected)
         self._motion_mask.expect(live, expected, states.started & (states.lost == 0))
         invalid = self.invalid_frames.find(frames.color, states.started)
-        alignment = self._aligner.track(invalid, guesses)
-        if self._config.check_slips:
-            alignment = self._mend_slips(alignment, frames, invalid)
+        self._feature_poses = {}
+
+        def track() -> Alignment:
+            tracked = self._aligner.track(invalid, guesses)
+            return self._question(tracked, frames, invalid) if self._config.check_slips else tracked
+
+        alignment = track()
         if self._motion_mask.can_doubt:
-            alignment = self._mask_moving(alignment, expected, invalid, guesses)
+            alignment = self._mask_moving(alignment, expected, invalid, track)
         if self._is_settled(alignment):
             return alignment
         if self._config.refuse_bad_fits:
@@ -352,33 +380,38 @@ class Localizer:
         is_open = states.started & (~alignment.tracked | (states.lost > 0) | (states.doubted > 0))
         return self._config.refuse_bad_fits and not is_open.any()
 
-    def _mend_slips(
+    def _question(
         self, alignment: Alignment, frames: Images, invalid: NDArray[np.bool_]
     ) -> Alignment:
-        """Align anew, at the finest level alone, what may have slipped along a surface.
+        """Align anew, at the finest level alone, what fits worse than is usual.
 
-        Fine texture that is much the same everywhere, such as a carpet's, is gone at the coarser
-        levels, which then slip along what geometry leaves open, and the texture all at once fits
-        badly. So the frame is aligned from where it was expected, and from where the features of
-        the last one put it, without them. Where a direction was left open, the pose along it is
-        the predicted one, and a camera that goes where it likes is not there: if the features do
-        not know better, the pose may be refused.
+        Coarser levels may lead to a wrong minimum: fine texture that is much the same everywhere,
+        such as a carpet's, is gone there, blur and noise leave little of the rest. So the frame is
+        aligned from where it was expected, and from where the features of the last one put it,
+        without them. Where a direction was left open, the pose along it is the predicted one, and
+        a camera that goes where it likes is not there: if the features do not know better, the
+        pose may be refused.
         """
         states, poses = self._states, self._states.poses
         asked = states.started & (states.lost == 0) & ~invalid
+        cost = alignment.statistics["cost"]
         is_open = asked & (alignment.statistics["degenerate_directions"] > 0)
         slipped = asked & is_leap(states.photometry, alignment.photometry, self._config.cauchy_rgb)
-        if not (slipped | is_open).any():
+        is_dear = asked & (cost > states.usual["cost"] + QUESTIONED)
+        failed = asked & ~alignment.tracked
+        questioned = slipped | is_open | is_dear | failed
+        if not questioned.any():
             return alignment
         by_features = np.full_like(poses, np.nan)
-        for env in np.flatnonzero(slipped | is_open):
+        most = np.where(is_open, AS_GOOD, MENDED)
+        for env in np.flatnonzero(questioned):
             found = self._feature_pose(int(env), frames)
             if found is not None:
                 by_features[env] = found[0]
-        at_most = np.where(is_open, AS_GOOD, MENDED)
+                most[env] = max(most[env], AGREED) if found[1].is_strong else most[env]
         for starts, whose, share in (
-            (states.motions, slipped, MENDED),
-            (invert(poses) @ by_features, slipped | is_open, at_most),
+            (states.motions, slipped | failed, MENDED),
+            (invert(poses) @ by_features, questioned, most),
         ):
             given = whose & np.isfinite(starts[:, 0, 0])
             if not given.any():
@@ -393,20 +426,23 @@ class Localizer:
 
     def _feature_pose(self, env: int, frames: Images) -> tuple[Float64, FeaturePose] | None:
         """Where (4, 4) the features of an env's last frame put the present one."""
-        images = frames.color[env], frames.depth[env]
-        return self.last_frames.find(env, *images, self._config.depth_cutoff_m)
+        if env not in self._feature_poses:
+            images = frames.color[env], frames.depth[env]
+            found = self.last_frames.find(env, *images, self._config.depth_cutoff_m)
+            self._feature_poses[env] = found
+        return self._feature_poses[env]
 
     def _mask_moving(
         self,
         alignment: Alignment,
         expected: Float64,
         invalid: NDArray[np.bool_],
-        guesses: Float64 | None,
+        track: Callable[[], Alignment],
     ) -> Alignment:
         """Look for what moves, align without it, and refuse a pose by which most would move."""
         if self._motion_mask.find(*self._trusted(alignment, expected)).any():
-            alignment = self._aligner.track(invalid, guesses)
-        alignment = self._doubt(alignment, expected, invalid, guesses)
+            alignment = track()
+        alignment = self._doubt(alignment, expected, invalid, track)
         self._motion_mask.find(*self._trusted(alignment, expected))
         is_most = alignment.tracked & (self._motion_mask.share() > MOSTLY_MOVING)
         return alignment.with_status(is_most, TrackingStatus.GEOMETRIC_MISMATCH)
@@ -416,7 +452,7 @@ class Localizer:
         alignment: Alignment,
         expected: Float64,
         invalid: NDArray[np.bool_],
-        guesses: Float64 | None,
+        track: Callable[[], Alignment],
     ) -> Alignment:
         """Ask whether the camera has moved or what it sees, where that may be confused.
 
@@ -434,7 +470,7 @@ class Localizer:
         moving = doubtful & mask.find(expected, doubtful, strict=True)
         if not moving.any():
             return alignment
-        again = self._aligner.track(invalid, guesses)
+        again = track()
         taken = moving & again.tracked & (again.statistics["degenerate_directions"] == 0)
         taken &= ~alignment.tracked | _is_refuted(alignment, again)
         mask.confirm(taken)
@@ -458,7 +494,8 @@ class Localizer:
         states, acceptance = self._states, self._config.acceptance
         appealed = self._failed(alignment) & np.isin(alignment.status, DISPUTED)
         for env in np.flatnonzero(appealed).tolist():
-            appealed[env] = is_nearly_accepted(alignment, env, acceptance)
+            usual = states.usual[env : env + 1]
+            appealed[env] = is_nearly_accepted(alignment, env, acceptance, usual)
         asked = (appealed | (alignment.tracked & (states.doubted > 0))) & (states.lost == 0)
         if where is not None:
             asked &= where
@@ -503,8 +540,8 @@ class Localizer:
         alignment = alignment.replace(taken, again.seen_from(states.poses))
         alone = np.zeros(len(origins), dtype=bool)
         for env in np.flatnonzero(self._failed(alignment) & ~alignment.uncertain & where):
-            may_doubt = states.lost[env] == 0 and states.doubted[env] < LONGEST_DOUBT
-            alone[env] = may_doubt and found[int(env)].is_strong
+            is_near = is_within(origins[env], states.poses[env], *FARTHEST)
+            alone[env] = states.lost[env] == 0 and found[int(env)].is_strong and is_near
         there = again.doubtful_at(origins, states.photometry)
         return alignment.replace(alone, there.seen_from(states.poses))
 

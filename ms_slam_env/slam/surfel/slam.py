@@ -131,7 +131,9 @@ class BatchedSurfelSlam(Saved):
         results = [self._follow(env, live, alignment) for env in range(self.batch)]
         self._correct_exposure(live, self._states.photometry)
         known = np.array([result.tracking_ok for result in results])
-        self._last_frames.keep(frames.color, frames.depth, self.poses, known)
+        self._last_frames.keep(
+            frames.color, self.motion_mask.still(frames.depth), self.poses, known
+        )
         self._fuse(live, frames, np.array([result.fused for result in results]))
         return self._close_loops(live, frames, results)
 
@@ -210,9 +212,9 @@ class BatchedSurfelSlam(Saved):
         status, states = TrackingStatus(alignment.status[env]), self._states
         uncertain = status == TrackingStatus.UNCERTAIN
         tracked = uncertain or status == TrackingStatus.OK
-        covariance = (
-            with_doubt(alignment.covariance[env]) if uncertain else alignment.covariance[env]
-        )
+        covariance = alignment.covariance[env]
+        if uncertain:
+            covariance = with_doubt(covariance, 1 + int(states.doubted[env]))
         relocalised = tracked and bool(states.lost[env])
         if tracked:
             states.accept(env, alignment, self.config.cauchy_rgb)

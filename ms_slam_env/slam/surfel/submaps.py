@@ -255,7 +255,7 @@ class AtlasSubmaps(Saved):
     With ``SurfelConfig.submaps`` "off" it stands still until it finds its map again, the only one.
     """
 
-    saved = ("_ledger", "_search", "_present", "_refused", "_expected", "_motion")
+    saved = ("_ledger", "_search", "_present", "_unmapped", "_expected", "_motion")
 
     def __init__(self, slam: BatchedSurfelSlam) -> None:
         self._slam = slam
@@ -269,7 +269,7 @@ class AtlasSubmaps(Saved):
         self._detached: list[DetachedMap] = []
         self._search = JointSearch()
         self._present = 0
-        self._refused = 0  # frames in a row that showed something and were not tracked
+        self._unmapped = 0  # frames in a row that showed something and were not mapped
         self._motion = np.eye(4)  # of the last tracked frame
         self._expected = np.eye(4)  # (4, 4) where that takes a camera that is lost
 
@@ -313,8 +313,11 @@ class AtlasSubmaps(Saved):
             return result
         if not result.tracking_ok:
             return self._labelled(self._after_refusal(frames, guess, result))
-        self._refused = 0
         self._expected, self._motion = result.T_world_camera, self._slam.motion()
+        self._unmapped = self._unmapped + 1 if result.uncertain else 0
+        if self._unmapped >= self._config.after and self._slam.shows_something(frames):
+            link = self._link(False) if result.covariance is None else result.covariance
+            return self._labelled(self._start(frames, link))
         if not self._detached:
             if self._ledger.has_several:
                 self._ledger.record(self._slam.last_frame(), self._present, self._expected)
@@ -344,8 +347,8 @@ class AtlasSubmaps(Saved):
             self._expected = np.array(guess, dtype=np.float64)
         if not self._slam.shows_something(frames):
             return result
-        self._refused += 1
-        if self._refused < self._config.after:
+        self._unmapped += 1
+        if self._unmapped < self._config.after:
             return result
         return self._start(frames, self._link(guess is not None))
 
@@ -367,7 +370,7 @@ class AtlasSubmaps(Saved):
             self._detached.append(self._slam.detach_map(self._present))
         self._slam.restart(self._expected)
         self._present = self._ledger.start(frame, self._expected, link)
-        self._search, self._refused = JointSearch(), 0
+        self._search, self._unmapped = JointSearch(), 0
         result = self._slam.track(frames.color, frames.depth)[0]
         if result.tracking_ok:
             self._ledger.record(frame, self._present, result.T_world_camera)
