@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _BOXES = "kinect+moving-objects,kind=box,count"
 _PEOPLE = "kinect+moving-objects,kind=person,speed_m_s=1,count"
-MASKED = "surfel,motion_mask=geometric"
+UNMASKED, MASKED = (f"surfel,motion_mask={mask}" for mask in ("none", "geometric"))
 DEFAULT_SEQUENCES = (
     *(f"living_room:{2000 + k}:{_BOXES}={1 + k % 3}" for k in range(4)),
     *(f"living_room:{2006 + k}:{_PEOPLE}={1 + k % 2}" for k in range(4)),
@@ -64,7 +64,7 @@ class MovingObjectsExperiment(Experiment, Checked):
 
     sequences: tuple[str, ...] = DEFAULT_SEQUENCES
     """scene:seed[:word[+word ...]]."""
-    backends: tuple[str, ...] = ("surfel", MASKED, "sparse", "volumetric")
+    backends: tuple[str, ...] = (UNMASKED, MASKED, "sparse", "volumetric")
     """NAME, parameters appended as in surfel,motion_mask=geometric."""
     image_size: str = "160x120"
     """Image size, such as 160x120."""

@@ -93,8 +93,8 @@ class EnvConfig(Checked):
             arm's forward kinematics), ``kinematics`` (noisy forward kinematics alone; SLAM only
             maps) or ``ground_truth``. Kinematics need an arm.
         slam: SLAM backend: a name, ``module:Class`` or a class. Options may be appended, as in
-            ``surfel,check_slips=true,refuse_open=true``, which suits motions as large as a step;
-            those of ``slam_config`` override them.
+            ``surfel,refuse_open=true,motion_mask=none,submaps=off``, which suits motions as large
+            as a step in a world that is still; those of ``slam_config`` override them.
         adaptation: how SLAM changes its configuration at run time: ``none``, ``divergence`` or
             ``agent`` (as in ``MSActiveSLAM-Adaptive-v0``); or a mapping with such a ``name`` and
             its options. Every frame is processed, whatever a configuration's ``keep_every``.
@@ -139,7 +139,7 @@ class EnvConfig(Checked):
     noise: str | NoiseConfig = "kinect"
     arm: ArmConfig = field(default_factory=ArmConfig)
     pose: str = chosen("slam", *POSE_SOURCES)
-    slam: str | type[SlamBackend] = "surfel,check_slips=true,refuse_open=true"
+    slam: str | type[SlamBackend] = "surfel,refuse_open=true,motion_mask=none,submaps=off"
     slam_config: dict[str, object] = field(default_factory=dict)
     adaptation: AdaptationConfig = field(default_factory=NoAdaptationConfig)
     frame_management: FrameSelectionConfig = field(default_factory=EveryFrameConfig)

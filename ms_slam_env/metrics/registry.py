@@ -29,6 +29,8 @@ RESULTS_VERSIONS = {
     4: "normals are weighed exactly, frames beyond doubt are asked once, planners draw from seeds "
     "of their own",
     5: "environments have M_I = 0.15 and M_D = 0.36, and align anew what may have slipped",
+    6: "SLAM judges alignments by the noise of the recording, asks features where they fit badly, "
+    "and masks what moves and goes on in submaps by default",
 }
 """Version to a description of its algorithms.
 

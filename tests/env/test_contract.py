@@ -432,7 +432,8 @@ def test_use_before_reset_says_so():
 
 
 def test_options_of_slam_stand_behind_its_name_and_in_slam_config():
-    assert EnvConfig().slam_config == {"check_slips": True, "refuse_open": True}
+    still = {"motion_mask": "none", "submaps": "off"}
+    assert EnvConfig().slam_config == {"refuse_open": True, **still}
     both = make_config({"slam": "surfel,check_slips=true", "slam_config": {"check_slips": False}})
     assert (both.slam, both.slam_config) == ("surfel", {"check_slips": False})
     assert replace(both, step_m=0.1).slam_config == {"check_slips": False}

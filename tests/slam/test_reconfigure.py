@@ -15,7 +15,8 @@ from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 
 SMALL = (80, 60)
 POSES = arc(14)
-BASE = SurfelConfig(max_surfels=60_000, unstable_window=4, compaction_interval=2)
+STILL = {"motion_mask": "none"}  # the mask starts anew with another size
+BASE = SurfelConfig(max_surfels=60_000, unstable_window=4, compaction_interval=2, **STILL)
 OTHERS = {
     "weight": replace(BASE, icp_rgb_weight=0.5),
     "iterations": replace(BASE, iterations=(1, 2)),

@@ -21,7 +21,7 @@ from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization, Images
 
 CAMERA = xtion("160x120")
-OPTIONS = {"max_surfels": 120_000, "depth_cutoff_m": 4.0}
+OPTIONS = {"max_surfels": 120_000, "depth_cutoff_m": 4.0, "submaps": "off"}
 EYE = np.array([-0.8, -0.8, 1.2])
 FRAMES = 45
 

@@ -185,16 +185,18 @@ class SurfelConfig(Checked):
         relocalisation: where a lost frame is searched besides around the last good pose: "ferns",
             at keyframes that resemble it, "features", where their ORB features put it if that leads
             nowhere, or "local", nowhere.
-        submaps: "atlas": a camera that stays lost goes on in a new map, which is joined to the old
-            one where that is seen again; "off": it waits. Of several cameras in lockstep each
-            waits.
+        submaps: "atlas": a camera whose frames stay out of the map goes on in a new one, which is
+            joined to the old one where that is seen again; "off": it waits. Of several cameras in
+            lockstep each waits.
         submap_rules: parameters of the former.
         motion_mask: "geometric": what moves is neither tracked nor mapped, see ``free_space_mask``;
             "none": the world is taken to be still.
         readout_s: time that a rolling shutter takes from the first row to the last, see
-            ``rolling_shutter``; 0: all rows are taken at once. It takes frames with their times.
-        check_slips: whether a frame whose grey values all at once fit worse, or that leaves a
-            direction open, is aligned anew at the finest level alone; see ``Localizer``.
+            ``rolling_shutter``; 0: all rows are taken at once. It takes frames with their times
+            and a ``motion_mask`` "none", to which what the shutter bends seems to move.
+        check_slips: whether a frame that fits worse than is usual, or leaves a direction open, is
+            aligned anew at the finest level alone, from where features put it too; see
+            ``Localizer``.
         refuse_open: with ``check_slips``, whether what stays open is refused: for a camera that can
             go back to where its pose was known.
         color_registration: "estimated": where the colour camera is, is found from the edges of the
@@ -229,11 +231,11 @@ class SurfelConfig(Checked):
     relocalisation: str = chosen("ferns", *RELOCALISATIONS)
     loop_closure: str = chosen("none", *LOOP_CLOSURES)
     loops: LoopConfig = field(default_factory=LoopConfig)
-    submaps: str = chosen("off", *SUBMAPS)
+    submaps: str = chosen("atlas", *SUBMAPS)
     submap_rules: SubmapConfig = field(default_factory=SubmapConfig)
-    motion_mask: str = chosen("none", *MOTION_MASKS)
+    motion_mask: str = chosen("geometric", *MOTION_MASKS)
     readout_s: float = bounded(0.0, 0.0, 1.0)
-    check_slips: bool = False
+    check_slips: bool = True
     refuse_open: bool = False
     color_registration: str = chosen("given", *COLOR_REGISTRATIONS)
 
@@ -245,11 +247,13 @@ class SurfelConfig(Checked):
     def paper(cls) -> SurfelConfig:
         """ElasticFusion as the paper explores it (ICRA 2017, section IV-A): ``PAPER``'s defaults.
 
-        Its loops are closed by deforming the map. The other parameters have no published value in
-        units of ours and stay as they are; docs/exploration.md goes through them.
+        Its loops are closed by deforming the map, and what was added here is off. The other
+        parameters have no published value in units of ours and stay as they are;
+        docs/exploration.md goes through them.
         """
         published = {name: default for name, (default, _, _) in PAPER.items()}
-        return cls(**published, loop_closure="deformation")  # type: ignore[arg-type]
+        own = {"motion_mask": "none", "submaps": "off", "check_slips": False}
+        return cls(**published, **own, loop_closure="deformation")  # type: ignore[arg-type]
 
     def capacity(self, columns: int) -> int:
         """Surfels that the map of a camera with images of so many columns has room for."""
