@@ -100,6 +100,20 @@ def test_features_are_the_same_whether_they_were_sought_before_or_not(sensor, st
         chain.keep(*images, start[None], np.ones(1, dtype=bool))
 
 
+def test_features_of_what_moves_are_left_out_of_the_last_frame(sensor, start):
+    """Depth is kept without it, so that the features sought with it serve no more."""
+    frames = [sensor.capture(start @ np.linalg.matrix_power(TURN, k), k) for k in range(3)]
+    still = frames[1].depth.copy()
+    still[:, :80] = 0
+    chain = _kept(frames[0], start)
+    chain.find(0, frames[1].color, frames[1].depth, 8.0)
+    chain.keep(frames[1].color[None], still[None], start[None], np.ones(1, dtype=bool))
+    found = chain.find(0, frames[2].color, frames[2].depth, 8.0)
+    fresh = _kept(RGBDFrame(frames[1].color, still), start)
+    again = fresh.find(0, frames[2].color, frames[2].depth, 8.0)
+    np.testing.assert_array_equal(found[0], again[0])
+
+
 def test_another_place_has_no_strong_support(sensor, start):
     elsewhere = sensor.capture(look_at(EYE, EYE + np.array([-1.0, 0.1, -0.35])), 1)
     found = _kept(sensor.capture(start, 0), start).find(0, elsewhere.color, elsewhere.depth, 8.0)

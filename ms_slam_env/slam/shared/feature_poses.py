@@ -166,7 +166,7 @@ class LastFrames(Saved):
         """Switch to a camera; stored frames of another size are dropped."""
         self._frames = FrameFeatures(intrinsics)
         self._known: dict[int, Features] = {}  # of the last frames
-        self._seen: dict[int, tuple[NDArray[np.uint8], Features]] = {}  # of frames asked for since
+        self._seen: dict[int, tuple[NDArray[np.uint8], Float32, Features]] = {}  # asked for since
         size = (len(self._poses), *intrinsics.shape)
         if self._depth.shape != size:
             self._poses[:] = np.nan
@@ -185,8 +185,8 @@ class LastFrames(Saved):
             self._color[env], self._depth[env] = color[env], depth[env]
             self._poses[env] = T_world_camera[env]
             self._known.pop(env, None)
-            if env in self._seen and np.array_equal(self._seen[env][0], color[env]):
-                self._known[env] = self._seen[env][1]
+            if env in self._seen and self._is_seen(env, color[env], depth[env]):
+                self._known[env] = self._seen[env][-1]
         self._seen = {}
 
     @property
@@ -208,6 +208,11 @@ class LastFrames(Saved):
         super().set_state(state)
         self._known, self._seen = {}, {}
 
+    def _is_seen(self, env: int, color: NDArray[np.uint8], depth: Float32) -> bool:
+        """Whether the features sought last for an env are those of these images."""
+        seen_color, seen_depth, _ = self._seen[env]
+        return np.array_equal(seen_color, color) and np.array_equal(seen_depth, depth)
+
     def find(
         self, env: int, color: NDArray[np.uint8], depth: Float32, cutoff_m: float
     ) -> tuple[Float64, FeaturePose] | None:
@@ -217,8 +222,8 @@ class LastFrames(Saved):
         of = self._frames.features_of
         if env not in self._known:
             self._known[env] = of(self._color[env], self._depth[env], cutoff_m)
-        if env not in self._seen or not np.array_equal(self._seen[env][0], color):
-            self._seen[env] = color, of(color, depth, cutoff_m)
-        before, now = self._known[env], self._seen[env][1]
+        if env not in self._seen or not self._is_seen(env, color, depth):
+            self._seen[env] = color, depth, of(color, depth, cutoff_m)
+        before, now = self._known[env], self._seen[env][-1]
         found = pose_from_features(before, now, self._frames.intrinsics)
         return None if found is None else (self._poses[env] @ found.T_reference_frame, found)

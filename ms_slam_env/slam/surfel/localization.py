@@ -74,7 +74,7 @@ class CameraStates(Stateful):
         time: (B,) frames taken.
         doubted: (B,) frames in a row whose pose is uncertain.
         usual: (B,) cost and shares of inliers of the alignments that were accepted of late,
-            ``UsualFit`` each.
+            ``acceptance.USUAL`` each.
     """
 
     poses: Float64
