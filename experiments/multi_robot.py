@@ -331,7 +331,8 @@ def serve(team: Team, T_world_map: dict[int, Float64], spec: MultiRobotSpec) -> 
     truths = [team.truths[k] for k in made.trajectories]
     before = [T @ team.robots[k].estimates for k, T in T_world_map.items()]
     K = team.robots[0].backend.intrinsics
-    fused = fuse_team(slam.make("surfel", K, **spec.params), team.robots, made).surface_points()
+    mapper = slam.make("surfel", K, **{"motion_mask": "none", **spec.params})
+    fused = fuse_team(mapper, team.robots, made).surface_points()
     laid = np.concatenate([
         transform_points(T, team.robots[k].backend.surface_points())
         for k, T in T_world_map.items()

@@ -310,7 +310,7 @@ class Relocalization(Experiment, Checked):
                 recordings.append(elsewhere.record(one.poses))
         maps, attempts = [], []
         for variant in spec.variants:
-            backend = slam.make("surfel", intrinsics, relocalisation=variant)
+            backend = slam.make("surfel", intrinsics, relocalisation=variant, submaps="off")
             mapping = run_sequence(backend, mapped, start=path[0])
             maps.append({"variant": variant, **_figures(mapping, path)})
             if mapping.lost_frames:

@@ -47,7 +47,7 @@ def test_it_tracks_and_maps(tiny: Any, sequence: Sequence) -> None:
     truth = sequence.frames[len(run) - 1].depth
     both = (truth > 0) & (views.depth[0] > 0)
     assert both.mean() > 0.5
-    assert np.median(np.abs(views.depth[0] - truth)[both]) < 0.08
+    assert np.median(np.abs(views.depth[0] - truth)[both]) < 0.05
 
 
 def test_its_state_is_complete(tiny: Any, sequence: Sequence) -> None:

@@ -116,6 +116,14 @@ REFUSED = {
         ({"maps": 0}, "maps"),
         ({"after": 300}, "after"),
     ],
+    "robustness": [
+        ({"sequences": ("no-such-scene:1",)}, "unknown scene 'no-such-scene'; valid choices: "),
+        ({"sequences": ("usme:no-such-sequence:1",)}, "unknown USME sequence .*city-traffic"),
+        ({"sequences": ("usme:city-traffic",)}, "is not usme:NAME:SEED"),
+        ({"backends": ("no-such-backend",)}, "unknown SLAM backend .*valid choices: surfel"),
+        ({"variations": ("upside-down",)}, "unknown variation .*valid choices: none"),
+        ({"image_sizes": ()}, "image_sizes and backends need one value"),
+    ],
     "slam_speed": [
         ({"frames": 1}, "SlamSpeed.frames = 1 is outside"),
         ({"warm_up": 80}, "SlamSpeed.warm_up = 80 is outside"),

@@ -78,22 +78,6 @@ def test_what_is_run_by_default_exists() -> None:
     assert len({spec.sequence for spec in specs}) == len(specs) == 2 * (6 + 10 + 8)
 
 
-@pytest.mark.parametrize(
-    ("options", "complaint"),
-    [
-        ({"sequences": ("no-such-scene:1",)}, "unknown scene 'no-such-scene'; valid choices: "),
-        ({"sequences": ("usme:no-such-sequence:1",)}, "unknown USME sequence .*city-traffic"),
-        ({"sequences": ("usme:city-traffic",)}, "is not usme:NAME:SEED"),
-        ({"backends": ("no-such-backend",)}, "unknown SLAM backend .*valid choices: surfel"),
-        ({"variations": ("upside-down",)}, "unknown variation .*valid choices: none"),
-        ({"image_sizes": ()}, "image_sizes and backends need one value"),
-    ],
-)
-def test_what_does_not_exist_is_refused_before_anything_runs(options, complaint) -> None:
-    with pytest.raises(InputError, match=complaint):
-        Robustness(**options)
-
-
 def test_a_recording_is_named_with_its_folder() -> None:
     made = Robustness(recordings=("h=folder:some/where",), image_sizes=("80x60",))
     (first, *_) = made.specs()

@@ -8,11 +8,12 @@ from arc import CAMERA, START, arc, black_frame
 from box_scene import BoxScene
 
 from ms_slam_env import slam
-from ms_slam_env.camera import RGBDFrame
+from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
+from ms_slam_env.slam.surfel.backend import SurfelSlam
 from ms_slam_env.slam.surfel.localization import Localizer
 
 CONFIG = SurfelConfig(max_surfels=60_000, depth_cutoff_m=4.0)
@@ -156,3 +157,27 @@ def test_bad_poses_are_refused(frames):
     with pytest.raises(InputError, match="depth holds"):
         batched.fuse(color, np.full_like(depth, np.nan), START[None])
     assert len(backend.surface_points()) == 0
+
+
+def test_what_only_maps_takes_no_error_of_a_pose_for_motion(box_scene: BoxScene):
+    """Frames of a still room, fused beside where they were taken as a poor odometry would."""
+    sensor = RGBDSensor(box_scene, xtion("80x60"), noise="none")
+    start = box_scene.sample_start(np.random.default_rng(0))
+    frame = sensor.capture(start, 0)
+    masked = {}
+    for config in (SurfelConfig(max_surfels=50_000), SurfelConfig.of_mapper(max_surfels=50_000)):
+        system = SurfelSlam(xtion("80x60"), config)
+        system.reset(start)
+        for k in range(20):
+            beside = start @ make_pose(np.eye(3), [0.0, 0.0, 0.1 * (k % 5 == 4)])
+            moving = system.fuse(frame, beside).moving
+            masked[config.motion_mask] = max(
+                masked.get(config.motion_mask, 0.0), 0.0 if moving is None else moving.mean()
+            )
+    assert masked["geometric"] > 0.05
+    assert masked["none"] == 0.0
+    for name in ("odometry", "sparse"):
+        backend = slam.make(name, xtion("80x60"))
+        backend.reset(start)
+        backend.track(frame)
+        assert backend._mapper.config.motion_mask == "none"

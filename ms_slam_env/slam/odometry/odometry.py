@@ -130,7 +130,7 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
         )
         self._judge_views(self.config.stock)
         kept = {name: getattr(self.config, name) for name in ("depth_cutoff_m", "max_surfels")}
-        self._map = SurfelSlam(intrinsics, SurfelConfig(**kept))
+        self._map = SurfelSlam(intrinsics, SurfelConfig.of_mapper(**kept))
         super().__init__(intrinsics)
 
     @property

@@ -47,7 +47,7 @@ class DenseMap(Saved):
     def __init__(self, intrinsics: Intrinsics, config: SparseConfig) -> None:
         self._surfels = SurfelSlam(
             intrinsics,
-            SurfelConfig(
+            SurfelConfig.of_mapper(
                 depth_cutoff_m=config.depth_cutoff_m,
                 max_surfels=config.max_surfels,
                 unstable_window=100_000,  # keyframes are few, and each one counts

@@ -159,6 +159,7 @@ def assess_alignment(
 
 
 _RATIOS = ("inlier_ratio", "photometric_inlier_ratio")
+FARTHEST_M, FARTHEST_DEG = 0.3, 30.0  # from frame to frame
 LARGEST_SIGMA = 0.04  # (metres, radians) of the worst direction that the view constrains
 
 
@@ -195,8 +196,9 @@ def _acceptance_thresholds(
     for name, value in most.items():
         thresholds[name] = np.where(strict, min(_STRICT[name], value), value)
     thresholds["degenerate_directions"] = np.where(strict, 0, 5)
-    thresholds["motion_m"] = np.minimum(1.0, 0.3 + 0.1 * np.array(lost))
-    thresholds["rotation_cos"] = np.cos(np.radians(np.minimum(60.0, 30.0 + 10.0 * np.array(lost))))
+    thresholds["motion_m"] = np.minimum(1.0, FARTHEST_M + 0.1 * np.array(lost))
+    most_deg = np.minimum(60.0, FARTHEST_DEG + 10.0 * np.array(lost))
+    thresholds["rotation_cos"] = np.cos(np.radians(most_deg))
     return thresholds
 
 
@@ -337,7 +339,7 @@ def is_nearly_accepted(
     return alignment.status_under(relaxed, env) == TrackingStatus.OK
 
 
-def with_doubt(covariance: Float64, frames: int = 1) -> Float64:
+def with_doubt(covariance: Float64, frames: int) -> Float64:
     """Covariance (6, 6) of a pose that has been uncertain for a number of frames."""
     return covariance + frames * np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
 

@@ -25,6 +25,8 @@ from ms_slam_env.slam.shared.alignment_check import (
 from ms_slam_env.slam.shared.feature_poses import FeaturePose, LastFrames
 from ms_slam_env.slam.shared.state import Stateful, check_has
 from ms_slam_env.slam.surfel.acceptance import (
+    FARTHEST_DEG,
+    FARTHEST_M,
     Alignment,
     accept_any_fit,
     acceptance_thresholds,
@@ -299,11 +301,10 @@ CLEARLY_APART = 30.0  # squared Mahalanobis distance; below 20 where nothing lea
 APART_M, APART_RAD = (0.006, 0.1), np.radians((0.4, 6.0))  # more than noise, less than a jump
 QUESTIONED = 0.15  # above the usual cost, from which an alignment is questioned
 MENDED = 0.9  # of the cost of an alignment that may have slipped
-AGREED = 1.01  # of that cost, where many features all over the image speak for the other
+AGREED = 1.01  # of that cost, where features are sure of the other
 # Of the cost of one that left a direction open, in which it is no judge: of 36 such frames of
 # validation seeds for which features led to an alignment it takes 34, 30 nearer, 2 farther.
 AS_GOOD = 1.5
-FARTHEST = 0.3, np.radians(30.0)  # motion of a frame that features alone speak for
 LONGEST_DOUBT = 10  # frames in a row that the map may leave uncertain
 RETRIES = 2  # further searches within a frame whose tracking failed
 
@@ -540,7 +541,8 @@ class Localizer:
         alignment = alignment.replace(taken, again.seen_from(states.poses))
         alone = np.zeros(len(origins), dtype=bool)
         for env in np.flatnonzero(self._failed(alignment) & ~alignment.uncertain & where):
-            is_near = is_within(origins[env], states.poses[env], *FARTHEST)
+            farthest = FARTHEST_M, np.radians(FARTHEST_DEG)
+            is_near = is_within(origins[env], states.poses[env], *farthest)
             alone[env] = states.lost[env] == 0 and found[int(env)].is_strong and is_near
         there = again.doubtful_at(origins, states.photometry)
         return alignment.replace(alone, there.seen_from(states.poses))

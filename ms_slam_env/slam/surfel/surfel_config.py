@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from ms_slam_env.config import Checked, bounded, check_counts, chosen
 from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M
@@ -254,6 +255,11 @@ class SurfelConfig(Checked):
         published = {name: default for name, (default, _, _) in PAPER.items()}
         own = {"motion_mask": "none", "submaps": "off", "check_slips": False}
         return cls(**published, **own, loop_closure="deformation")  # type: ignore[arg-type]
+
+    @classmethod
+    def of_mapper(cls, **options: Any) -> SurfelConfig:
+        """Only maps, at the poses of another backend, whose errors would seem to be motion."""
+        return cls(**{"motion_mask": "none", "submaps": "off", **options})
 
     def capacity(self, columns: int) -> int:
         """Surfels that the map of a camera with images of so many columns has room for."""
