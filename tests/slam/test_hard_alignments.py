@@ -23,6 +23,7 @@ from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import HandheldPath, Sequence, open_sequence
 from ms_slam_env.slam import SlamBackend
 from ms_slam_env.slam.shared.alignment_check import TrackingStatus
+from ms_slam_env.slam.shared.feature_poses import FeaturePose
 from ms_slam_env.slam.surfel import localization
 from ms_slam_env.slam.surfel.acceptance import (
     Alignment,
@@ -177,12 +178,23 @@ def test_what_is_usual_follows_accepted_frames_only():
     for _ in range(100):
         states.accept(0, found, 1.0)
     assert states.usual["cost"][0] == pytest.approx(cost, rel=1e-3)
+    assert states.usual["surprise"][0] < 1e-3  # the same motion again and again
     before = states.usual.copy()
     in_doubt = found.with_status(np.ones(1, dtype=bool), TrackingStatus.UNCERTAIN)
     states.accept(0, in_doubt, 1.0)
     assert states.usual == before
     states.reset(0, np.eye(4))
     assert states.usual == fit_of_noise(1)
+
+
+def test_features_deny_what_is_farther_away_than_both_err():
+    found, _ = _frames().align(RIGHT[0], CONFIG)
+    pose, covariance = found.T_world_live[0], np.diag([1e-4] * 6)  # 1 cm along each axis
+    for step_m, is_denied in ((0.1, False), (0.3, True)):
+        # Three times what they say, so that 0.1 m are 3.3 standard deviations.
+        elsewhere = pose @ make_pose(np.eye(3), [step_m, 0.0, 0.0])
+        features = FeaturePose(elsewhere, 100, covariance)
+        assert localization._is_denied(found, 0, elsewhere, features) == is_denied
 
 
 def test_another_light_leaves_the_scale_of_the_noise():

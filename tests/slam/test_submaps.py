@@ -21,6 +21,8 @@ from ms_slam_env.geometry import (
 )
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.shared.submap_frames import SubmapLedger
+from ms_slam_env.slam.surfel.keyframe_search import Images
+from ms_slam_env.slam.surfel.submaps import MapFinder
 from ms_slam_env.slam.surfel.trajectory_history import DetachedMap
 
 CAMERA = xtion("160x120")
@@ -177,6 +179,18 @@ def test_frames_that_stay_out_of_the_map_start_another_where_features_put_them(f
     assert doubt[2] > doubt[1]  # of the submap's start
     link = backend.submaps().links[1]
     assert np.sqrt(np.trace(link[:3, :3])) >= 0.03 * np.sqrt(9) - 1e-9
+
+
+def test_a_new_submap_and_searches_in_old_ones_know_the_noise(frames):
+    backend, _ = _run(frames[:JUMP])
+    usual, reference = backend._slam.noise()
+    assert usual["cost"] < 1.0  # learnt
+    backend._slam.restart(PATH[0])
+    assert backend._slam.noise() == (usual, reference)
+    finder = MapFinder(backend._slam)
+    images = Images(frames[JUMP].color[None], frames[JUMP].depth[None])
+    finder.near(images, backend._slam.detach_map(0), PATH[JUMP])
+    assert finder._slam.noise() == (usual, reference)
 
 
 def test_off_stands_still(frames):

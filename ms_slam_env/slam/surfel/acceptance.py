@@ -211,8 +211,12 @@ _STRICT = {
 }
 
 
-USUAL = np.dtype([(name, np.float64) for name in ("cost", *_RATIOS)])
-"""What alignments are like that were accepted of late: of a recording's own noise."""
+USUAL = np.dtype([(name, np.float64) for name in ("cost", *_RATIOS, "surprise")])
+"""What alignments are like that were accepted of late: of a recording's own noise.
+
+``surprise`` is the difference between motion and expected motion, in metres or radians, whichever
+is more.
+"""
 _FOLLOWS = 0.1  # share of the way from what is usual to the last frame
 _EXPECTED = {"cost": 1.05, "inlier_ratio": 0.9, "photometric_inlier_ratio": 0.85}
 _LARGEST_COST, _SMALLEST_RATIO = 1.9, 0.5  # that noise makes acceptable
@@ -223,10 +227,11 @@ def fit_of_noise(batch: int) -> NDArray[Any]:
     return np.full(batch, 1.0).astype(USUAL)
 
 
-def follow_usual(usual: np.void, statistics: np.void) -> None:
+def follow_usual(usual: np.void, statistics: np.void, surprise: float) -> None:
     """Learn, in place, from a frame that was accepted."""
-    for name in USUAL.names or ():
-        usual[name] += _FOLLOWS * (float(statistics[name]) - usual[name])
+    found = {name: float(statistics[name]) for name in ("cost", *_RATIOS)}
+    for name, value in (found | {"surprise": surprise}).items():
+        usual[name] += _FOLLOWS * (value - usual[name])
 
 
 def at_usual_noise(thresholds: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any]:

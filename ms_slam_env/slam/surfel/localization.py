@@ -116,6 +116,9 @@ class CameraStates(Stateful):
         """Move on to where the frame was tracked."""
         own = self._own
         own["poses"][env] = alignment.T_world_live[env]
+        if alignment.tracked[env]:
+            surprise = _surprise(alignment.T_model_live, self.motions)[env]
+            follow_usual(own["usual"][env], alignment.statistics[env], float(surprise))
         # Across a gap the motion is not one frame's.
         motion = np.eye(4) if self.lost[env] else alignment.T_model_live[env]
         # What a degenerate view leaves open was predicted itself: let it die away.
@@ -123,8 +126,6 @@ class CameraStates(Stateful):
         own["motions"][env] = damped(motion) if is_degenerate else motion
         own["lost"][env] = 0
         own["doubted"][env] = self.doubted[env] + 1 if alignment.uncertain[env] else 0
-        if alignment.tracked[env]:
-            follow_usual(own["usual"][env], alignment.statistics[env])
         own["photometry"][env] = next_photometry(
             self.photometry[env],
             alignment.photometry[env],
@@ -148,8 +149,17 @@ class CameraStates(Stateful):
 
     def forget_exposure(self, env: int) -> None:
         """Take an env's next frame to be exposed like the map; what its noise is stays known."""
-        reference = self.photometry[env]["reference"]
+        noise = self.noise(env)
         self._own["photometry"][env] = same_exposure(1)[0]
+        self.expect_noise(env, *noise)
+
+    def noise(self, env: int) -> tuple[np.void, float]:
+        """What an env's recording has shown of its noise: ``usual``, and the scale of residuals."""
+        return self.usual[env].copy(), float(self.photometry[env]["reference"])
+
+    def expect_noise(self, env: int, usual: np.void, reference: float) -> None:
+        """Judge an env's frames by the noise that ``noise`` gave, of whatever map."""
+        self._own["usual"][env] = usual
         self._own["photometry"][env]["reference"] = reference
 
     def count(self, frames: int = 1) -> None:
@@ -301,6 +311,10 @@ CLEARLY_APART = 30.0  # squared Mahalanobis distance; below 20 where nothing lea
 APART_M, APART_RAD = (0.006, 0.1), np.radians((0.4, 6.0))  # more than noise, less than a jump
 QUESTIONED = 0.15  # above the usual cost, from which an alignment is questioned
 MENDED = 0.9  # of the cost of an alignment that may have slipped
+SURPRISE = 0.1  # metres or radians between a motion and the expected one, likewise,
+UNUSUAL = 2.0  # if it is so many times what is usual: some cameras move by leaps
+DENIED = 1.25  # of that cost, where features are sure that the pose is elsewhere
+FEATURES_ERR = 3.0  # times what the noise of their corners lets expect
 AGREED = 1.01  # of that cost, where features are sure of the other
 # Of the cost of one that left a direction open, in which it is no judge: of 36 such frames of
 # validation seeds for which features led to an alignment it takes 34, 30 nearer, 2 farther.
@@ -400,16 +414,20 @@ class Localizer:
         slipped = asked & is_leap(states.photometry, alignment.photometry, self._config.cauchy_rgb)
         is_dear = asked & (cost > states.usual["cost"] + QUESTIONED)
         failed = asked & ~alignment.tracked
-        questioned = slipped | is_open | is_dear | failed
+        surprise = _surprise(alignment.T_model_live, states.motions)
+        surprises = asked & (surprise > np.maximum(SURPRISE, UNUSUAL * states.usual["surprise"]))
+        questioned = slipped | is_open | is_dear | failed | surprises
         if not questioned.any():
             return alignment
         by_features = np.full_like(poses, np.nan)
         most = np.where(is_open, AS_GOOD, MENDED)
-        for env in np.flatnonzero(questioned):
-            found = self._feature_pose(int(env), frames)
+        for env in map(int, np.flatnonzero(questioned)):
+            found = self._feature_pose(env, frames)
             if found is not None:
                 by_features[env] = found[0]
-                most[env] = max(most[env], AGREED) if found[1].is_strong else most[env]
+                if found[1].is_strong:
+                    is_denied = _is_denied(alignment, env, *found)
+                    most[env] = max(most[env], DENIED if is_denied else AGREED)
         for starts, whose, share in (
             (states.motions, slipped | failed, MENDED),
             (invert(poses) @ by_features, questioned, most),
@@ -605,11 +623,30 @@ def _is_refuted(alignment: Alignment, again: Alignment) -> NDArray[np.bool_]:
     return is_worse
 
 
+def _is_denied(alignment: Alignment, env: int, pose: Float64, found: FeaturePose) -> bool:
+    """Whether an env's alignment is farther from where features put it than both err."""
+    twist = se3_log(invert(pose) @ alignment.T_world_live[env])
+    covariance = FEATURES_ERR**2 * found.covariance + alignment.covariance[env]
+    return bool(twist @ np.linalg.pinv(covariance) @ twist > CLEARLY_APART)
+
+
 def _is_apart(poses: Float64, others: Float64) -> NDArray[np.bool_]:
     """Which of the poses (B, 4, 4) differ, but not so much that ``others`` tell nothing."""
+    step, turn = _differences(poses, others)
+    is_more = (step > APART_M[0]) | (turn > APART_RAD[0])
+    return is_more & (step < APART_M[1]) & (turn < APART_RAD[1])
+
+
+def _differences(
+    poses: Float64, others: Float64
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Metres (B,) and radians (B,) between poses (B, 4, 4)."""
     step = np.linalg.norm(poses[:, :3, 3] - others[:, :3, 3], axis=1)
     # The trace of R_other^T R is the sum of the products of all elements.
     cosine = ((poses[:, :3, :3] * others[:, :3, :3]).sum(axis=(1, 2)) - 1) / 2
-    turn = np.arccos(np.clip(cosine, -1, 1))
-    is_more = (step > APART_M[0]) | (turn > APART_RAD[0])
-    return is_more & (step < APART_M[1]) & (turn < APART_RAD[1])
+    return step, np.arccos(np.clip(cosine, -1, 1))
+
+
+def _surprise(motions: Float64, expected: Float64) -> NDArray[np.float64]:
+    """Difference (B,) of motions (B, 4, 4), metres or radians, whichever is more."""
+    return np.maximum(*_differences(motions, expected))

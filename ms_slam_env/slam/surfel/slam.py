@@ -290,10 +290,22 @@ class BatchedSurfelSlam(Saved):
         self.aligner.forget_view()
 
     def restart(self, T_world_camera: Float64, env: int = 0) -> None:
-        """Forget an env's map and its last frame, which is to be taken first of a new one."""
-        frame = self.last_frame(env)
+        """Forget an env's map and its last frame, which is to be taken first of a new one.
+
+        What the recording's noise is stays known.
+        """
+        frame, noise = self.last_frame(env), self.noise(env)
         self.reset(T_world_camera, env)
         self._states.set_time(env, frame)
+        self.expect_noise(noise, env)
+
+    def noise(self, env: int = 0) -> tuple[np.void, float]:
+        """What an env's recording has shown of its noise."""
+        return self._states.noise(env)
+
+    def expect_noise(self, noise: tuple[np.void, float], env: int = 0) -> None:
+        """Judge an env's frames by the ``noise`` of another SLAM of the recording."""
+        self._states.expect_noise(env, *noise)
 
     def move_camera(self, T: Float64, env: int = 0) -> None:
         """Move an env's camera by ``T`` (4, 4) of the world."""

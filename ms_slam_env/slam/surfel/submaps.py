@@ -123,6 +123,7 @@ class MapFinder:
         if self._loaded is not other:
             self._slam.attach_map(other)
             self._loaded = other
+        self._slam.expect_noise(self._present.noise())
         return FrameLookup(self._slam, frames)
 
 
