@@ -102,6 +102,7 @@ def test_frames_without_a_known_motion_stay(rolling, interval_s):
 
 
 def _tracked(frames: list[RGBDFrame], **options: float) -> np.ndarray:
+    # The mask takes what the first frames, not yet levelled, bend in this scene for motion.
     rules = {"max_surfels": 60_000, "motion_mask": "none"}
     system = slam.make("surfel", CAMERA, **rules, **options)
     system.reset(START)

@@ -193,8 +193,7 @@ class SurfelConfig(Checked):
         motion_mask: "geometric": what moves is neither tracked nor mapped, see ``free_space_mask``;
             "none": the world is taken to be still.
         readout_s: time that a rolling shutter takes from the first row to the last, see
-            ``rolling_shutter``; 0: all rows are taken at once. It takes frames with their times
-            and a ``motion_mask`` "none", to which what the shutter bends seems to move.
+            ``rolling_shutter``; 0: all rows are taken at once. It takes frames with their times.
         check_slips: whether a frame that fits worse than is usual, or leaves a direction open, is
             aligned anew at the finest level alone, from where features put it too; see
             ``Localizer``.
