@@ -155,6 +155,9 @@ def test_a_noisy_recording_is_judged_by_its_own_noise():
     assert relaxed["inlier_ratio"] == pytest.approx(0.65 - 0.05)
     assert relaxed["photometric_inlier_ratio"] == pytest.approx(0.7 - 0.05)
     assert _thresholds(True, **usual)["cost"] == pytest.approx(1.3 + 0.25)
+    conflicting = _thresholds(True, depth_conflict_ratio=0.06)["depth_conflict_ratio"]
+    assert conflicting == pytest.approx(0.12 + 0.03)
+    assert _thresholds(True, depth_conflict_ratio=0.9)["depth_conflict_ratio"] == 0.25
     hopeless = _thresholds(False, cost=5.0, inlier_ratio=0.0, photometric_inlier_ratio=0.0)
     assert hopeless["cost"] == 1.9
     assert hopeless["inlier_ratio"] == hopeless["photometric_inlier_ratio"] == 0.5

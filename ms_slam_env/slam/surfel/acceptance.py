@@ -211,25 +211,34 @@ _STRICT = {
 }
 
 
-USUAL = np.dtype([(name, np.float64) for name in ("cost", *_RATIOS, "surprise")])
+_FIT = ("cost", "depth_conflict_ratio", *_RATIOS)
+USUAL = np.dtype([(name, np.float64) for name in (*_FIT, "surprise")])
 """What alignments are like that were accepted of late: of a recording's own noise.
 
 ``surprise`` is the difference between motion and expected motion, in metres or radians, whichever
 is more.
 """
 _FOLLOWS = 0.1  # share of the way from what is usual to the last frame
-_EXPECTED = {"cost": 1.05, "inlier_ratio": 0.9, "photometric_inlier_ratio": 0.85}
-_LARGEST_COST, _SMALLEST_RATIO = 1.9, 0.5  # that noise makes acceptable
+_EXPECTED = {
+    "cost": 1.05,
+    "depth_conflict_ratio": 0.03,
+    "inlier_ratio": 0.9,
+    "photometric_inlier_ratio": 0.85,
+}
+_LARGEST = {"cost": 1.9, "depth_conflict_ratio": 0.25}  # that noise makes acceptable
+_SMALLEST_RATIO = 0.5
 
 
 def fit_of_noise(batch: int) -> NDArray[Any]:
     """What is usual (B,) with the noise that ``SurfelConfig`` expects."""
-    return np.full(batch, 1.0).astype(USUAL)
+    usual = np.ones(batch, dtype=USUAL)
+    usual["depth_conflict_ratio"] = 0.0
+    return usual
 
 
 def follow_usual(usual: np.void, statistics: np.void, surprise: float) -> None:
     """Learn, in place, from a frame that was accepted."""
-    found = {name: float(statistics[name]) for name in ("cost", *_RATIOS)}
+    found = {name: float(statistics[name]) for name in _FIT}
     for name, value in (found | {"surprise": surprise}).items():
         usual[name] += _FOLLOWS * (value - usual[name])
 
@@ -242,9 +251,10 @@ def at_usual_noise(thresholds: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any
     demanded of it is less by the difference.
     """
     relaxed = thresholds.copy()
-    excess = np.maximum(usual["cost"] - _EXPECTED["cost"], 0.0)
-    most = np.maximum(thresholds["cost"], _LARGEST_COST)
-    relaxed["cost"] = np.minimum(thresholds["cost"] + excess, most)
+    for name, largest in _LARGEST.items():
+        excess = np.maximum(usual[name] - _EXPECTED[name], 0.0)
+        most = np.maximum(thresholds[name], largest)
+        relaxed[name] = np.minimum(thresholds[name] + excess, most)
     for name in _RATIOS:
         lack = np.maximum(_EXPECTED[name] - usual[name], 0.0)
         least = np.minimum(thresholds[name], _SMALLEST_RATIO)
