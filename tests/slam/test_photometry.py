@@ -99,12 +99,12 @@ def test_the_scale_is_that_of_cauchys_distribution(scale):
 def test_conflict_lowers_trust_and_agreement_restores_it():
     light = same_exposure(1)
     for _ in range(5):
-        light[0] = next_photometry(light[0], light[0], 5.0, 1.0)
+        light = next_photometry(light, light, np.array([5.0]), 1.0)
     assert light["trust"][0] == pytest.approx(0.2**5, rel=0.05)
     blind = geometry_only(light)
-    assert next_photometry(light[0], blind[0], 0.0, 1.0)["trust"] == light["trust"][0]
+    assert next_photometry(light, blind, np.zeros(1), 1.0)["trust"] == light["trust"]
     for _ in range(100):
-        light[0] = next_photometry(light[0], light[0], 0.1, 1.0)
+        light = next_photometry(light, light, np.array([0.1]), 1.0)
     assert light["trust"][0] == 1.0
 
 

@@ -61,24 +61,30 @@ def geometry_only(photometry: NDArray[Any]) -> NDArray[Any]:
 
 
 def next_photometry(
-    before: np.void, frame: np.void, conflict: float, least_scale: float
-) -> np.void:
-    """Photometry of an env after a frame was tracked with ``before`` and ended as ``frame``.
+    before: NDArray[Any], frame: NDArray[Any], conflict: NDArray[np.float64], least_scale: float
+) -> NDArray[Any]:
+    """Photometry (B,) after frames were tracked with ``before`` and ended as ``frame``.
 
-    ``conflict`` is chi squared between the poses that depth and grey values ask for. A recording
-    whose colour and depth are not registered has much of it, again and again; its grey values are
-    trusted less until the two agree within what is left of the photometric term's certainty.
+    ``conflict`` (B,) is chi squared between the poses that depth and grey values ask for. A
+    recording whose colour and depth are not registered has much of it, again and again; its grey
+    values are trusted less until the two agree within what is left of the photometric term's
+    certainty.
     """
     after = frame.copy()
-    share = max(1.0, USUAL_SCALE * float(frame["scale"]) / least_scale)
-    usual = float(before["reference"])
-    after["reference"] = share if share > usual else usual + SCALE_FALLS * (share - usual)
-    trust = float(before["trust"])
-    if frame["trust"] > 0.0:  # else grey values had no say, and nothing was learnt about them
-        falls = max(TRUST_FALLS, LARGEST_CONFLICT / max(conflict, LARGEST_CONFLICT))
-        trust *= falls if conflict > LARGEST_CONFLICT else TRUST_GROWS
-    after["trust"] = min(1.0, max(LEAST_TRUST, trust))
+    share = at_least(1.0, USUAL_SCALE * frame["scale"].astype(np.float64) / least_scale)
+    usual = before["reference"].astype(np.float64)
+    after["reference"] = np.where(share > usual, share, usual + SCALE_FALLS * (share - usual))
+    falls = at_least(TRUST_FALLS, LARGEST_CONFLICT / at_least(LARGEST_CONFLICT, conflict))
+    change = np.where(conflict > LARGEST_CONFLICT, falls, TRUST_GROWS)
+    # Without trust grey values had no say, and nothing was learnt about them.
+    trust = before["trust"].astype(np.float64) * np.where(frame["trust"] > 0.0, change, 1.0)
+    after["trust"] = np.minimum(1.0, at_least(LEAST_TRUST, trust))
     return after
+
+
+def at_least(least: float, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The values, but ``least`` where they are less, or no number."""
+    return np.where(values > least, values, least)
 
 
 def is_leap(before: NDArray[Any], frame: NDArray[Any], least_scale: float) -> Bool:

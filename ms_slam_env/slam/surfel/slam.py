@@ -10,7 +10,6 @@ are stable.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,11 +19,10 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
-from ms_slam_env.slam.shared.alignment_check import MAP_REASONS, TrackingStatus
 from ms_slam_env.slam.shared.ferns import Candidate
 from ms_slam_env.slam.shared.state import Saved, check_has
 from ms_slam_env.slam.slam_backend import TrackResult
-from ms_slam_env.slam.surfel.acceptance import Alignment, with_doubt
+from ms_slam_env.slam.surfel.acceptance import Alignment, doubt
 from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask
 from ms_slam_env.slam.surfel.keyframe_search import Images, make_relocalization
@@ -37,6 +35,7 @@ from ms_slam_env.slam.surfel.preprocessing import LiveFrame
 from ms_slam_env.slam.surfel.rolling_shutter import Shutter
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+from ms_slam_env.slam.surfel.tracked_batch import TrackedBatch, tracked_batch
 from ms_slam_env.slam.surfel.tracker import model_stride
 from ms_slam_env.slam.surfel.trajectory_history import DetachedMap
 
@@ -114,10 +113,22 @@ class BatchedSurfelSlam(Saved):
         T_world_camera_guess: Sequence[ArrayLike | None] | None = None,
         times_s: Sequence[float] | None = None,
     ) -> list[TrackResult]:
+        """Track and fuse one frame per env, with a result for each; see ``track_arrays``."""
+        found = self.track_arrays(color, depth, T_world_camera_guess, times_s)
+        return found.results(self.motion_mask.mask)
+
+    def track_arrays(
+        self,
+        color: NDArray[np.uint8],
+        depth: NDArray[np.float32],
+        T_world_camera_guess: Sequence[ArrayLike | None] | None = None,
+        times_s: Sequence[float] | None = None,
+    ) -> TrackedBatch:
         """Track and fuse one frame per env: colour (B, H, W, 3) uint8, depth (B, H, W) metres.
 
         ``T_world_camera_guess`` holds for every env a pose (4, 4) to start from too, or None;
         ``times_s`` says when the frames were taken, without which no rolling shutter is undone.
+        The arrays of the result are the caller's own.
         """
         guesses = check_guesses(T_world_camera_guess, self.batch)
         self._select_surfels(self._states.lost)
@@ -128,14 +139,13 @@ class BatchedSurfelSlam(Saved):
         self._shutter.take_time(times_s)
         if self._shutter.is_rolling:
             live, frames, alignment = self._unroll(taken, alignment)
-        results = [self._follow(env, live, alignment) for env in range(self.batch)]
+        found = self._follow(live, alignment)
         self._correct_exposure(live, self._states.photometry)
-        known = np.array([result.tracking_ok for result in results])
         self._last_frames.keep(
-            frames.color, self.motion_mask.still(frames.depth), self.poses, known
+            frames.color, self.motion_mask.still(frames.depth), self.poses, found.tracking_ok
         )
-        self._fuse(live, frames, np.array([result.fused for result in results]))
-        return self._close_loops(live, frames, results)
+        self._fuse(live, frames, found.fused)
+        return self._close_loops(live, frames, found)
 
     def fuse(
         self,
@@ -156,10 +166,8 @@ class BatchedSurfelSlam(Saved):
         self.motion_mask.expect(live, poses, states.started)
         self.motion_mask.find(poses, states.started)
         states.follow(poses, motions)
-        for env in np.flatnonzero(~states.started):
-            # With too little to see, the first frame that is tracked starts the map.
-            if _readings(int(env), live) >= FEWEST_READINGS:
-                states.start(int(env))
+        # With too little to see, the first frame that is tracked starts the map.
+        states.start(~states.started & (_readings(live, ~states.started) >= FEWEST_READINGS))
         everywhere = np.ones(self.batch, dtype=bool)
         self._last_frames.keep(frames.color, frames.depth, poses, everywhere)
         self._fuse(live, frames, everywhere)
@@ -193,46 +201,20 @@ class BatchedSurfelSlam(Saved):
             self._states.count(-1)
             self._fuse(live, frames, where)
 
-    def _follow(self, env: int, live: LiveFrame, alignment: Alignment) -> TrackResult:
-        """Pose of a live frame: given for the first, tracked or searched for the others."""
-        started = self._states.started[env]
-        return self._move_on(env, alignment) if started else self._start(env, live)
+    def _follow(self, live: LiveFrame, alignment: Alignment) -> TrackedBatch:
+        """Poses of the live frames: given for the first, tracked or searched for the others.
 
-    def _start(self, env: int, live: LiveFrame) -> TrackResult:
-        """Take the first frame at the given pose, if there is something in it to map."""
-        pose = self.poses[env].copy()
-        if _readings(env, live) < FEWEST_READINGS:
-            reason = "the first frame has too few depth readings"
-            return TrackResult(pose, False, inlier_fraction=0.0, reason=reason, overlap=0.0)
-        self._states.start(env)
-        return TrackResult(pose, True, moving=self.motion_mask.mask(env))
-
-    def _move_on(self, env: int, alignment: Alignment) -> TrackResult:
-        """Take the pose of a frame that was tracked, else hold the last one."""
-        status, states = TrackingStatus(alignment.status[env]), self._states
-        uncertain = status == TrackingStatus.UNCERTAIN
-        tracked = uncertain or status == TrackingStatus.OK
-        covariance = alignment.covariance[env]
-        if uncertain:
-            covariance = with_doubt(covariance, 1 + int(states.doubted[env]))
-        relocalised = tracked and bool(states.lost[env])
-        if tracked:
-            states.accept(env, alignment, self.config.cauchy_rgb)
-        else:
-            states.hold(env)
-        return TrackResult(
-            T_world_camera=states.poses[env].copy(),
-            tracking_ok=tracked,
-            relocalised=relocalised,
-            inlier_fraction=float(alignment.statistics[env]["inlier_ratio"]),
-            residual_m=float(alignment.statistics[env]["residual_m"]),
-            reason=MAP_REASONS[status],
-            degenerate_directions=int(alignment.statistics[env]["degenerate_directions"]),
-            covariance=covariance if tracked else None,
-            uncertain=uncertain,
-            overlap=float(alignment.statistics[env]["overlap"]),
-            moving=self.motion_mask.mask(env),
-        )
+        Where a frame was not tracked the last pose is held. A first frame is taken if there is
+        something in it to map.
+        """
+        states = self._states
+        started, lost, doubted = states.started.copy(), states.lost > 0, states.doubted.copy()
+        begins = ~started & (_readings(live, ~started) >= FEWEST_READINGS)
+        states.start(begins)
+        tracked = started & (alignment.tracked | alignment.uncertain)
+        states.accept(tracked, alignment, self.config.cauchy_rgb)
+        states.hold(started & ~tracked)
+        return tracked_batch(alignment, started, begins, lost, states.poses, doubt(1 + doubted))
 
     def _fuse(self, live: LiveFrame, frames: Images, good: NDArray[np.bool_]) -> None:
         """Fuse the frames with a good pose; a fast camera's readings weigh less."""
@@ -249,26 +231,23 @@ class BatchedSurfelSlam(Saved):
             self.aligner.forget_view()
         states.count()
 
-    def _close_loops(
-        self, live: LiveFrame, frames: Images, results: list[TrackResult]
-    ) -> list[TrackResult]:
-        """Close loops after fusion; a closed one corrects the map and the pose."""
+    def _close_loops(self, live: LiveFrame, frames: Images, found: TrackedBatch) -> TrackedBatch:
+        """Close loops after fusion; a closed one corrects the map and the pose, and ``found``."""
 
         def similar(env: int, before: int) -> list[Candidate]:
             return self.relocalization.similar(env, frames, before)
 
-        tracked = np.array([result.fused for result in results])
-        closed = self.loops.close(live, self.poses, self._states.time - 1, tracked, similar)
+        closed = self.loops.close(live, self.poses, self._states.time - 1, found.fused, similar)
         for env, (loop, pose) in closed.items():
-            results[env] = replace(results[env], loop=loop)
+            found.loops[env] = loop
             if not loop.bent:
                 continue
             self._states.move_to(env, pose)
             self._last_frames.move(env, pose)
             self.relocalization.move_keyframes(env, *self.loops.trajectory(env))
             self.motion_mask.forget(env)  # the map and the earlier frames no longer agree
-            results[env] = replace(results[env], T_world_camera=pose.copy(), loop_closed=True)
-        return results
+            found.T_world_camera[env], found.loop_closed[env] = pose, True
+        return found
 
     # -- Maps that come and go ---------------------------------------------------------------
 
@@ -320,7 +299,7 @@ class BatchedSurfelSlam(Saved):
     def mark_lost(self, env: int = 0) -> None:
         """Seek an env's next frame in its map, whatever the light is by now."""
         if self._states.started[env]:
-            self._states.hold(env)
+            self._states.hold(np.arange(self.batch) == env)
             self._states.forget_exposure(env)
             self.motion_mask.forget(env)
 
@@ -361,6 +340,9 @@ class BatchedSurfelSlam(Saved):
         self.aligner.forget_view()
 
 
-def _readings(env: int, live: LiveFrame) -> float:
-    """Share of a frame's pixels that have depth."""
-    return float((live.depth[env].numpy() > 0).mean())
+def _readings(live: LiveFrame, where: NDArray[np.bool_]) -> Float64:
+    """Share of the pixels of frames that have depth (B,); 0 for envs other than ``where`` (B,)."""
+    shares = np.zeros(len(where))
+    for env in map(int, np.flatnonzero(where)):
+        shares[env] = (live.depth[env].numpy() > 0).mean()
+    return shares
