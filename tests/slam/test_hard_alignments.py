@@ -177,8 +177,7 @@ def test_what_is_usual_follows_accepted_frames_only():
     states.accept(here, found, 1.0)
     assert states.usual["cost"][0] == pytest.approx(1 + 0.1 * (cost - 1))
     for _ in range(100):
-        here = np.ones(1, dtype=bool)
-    states.accept(here, found, 1.0)
+        states.accept(here, found, 1.0)
     assert states.usual["cost"][0] == pytest.approx(cost, rel=1e-3)
     assert states.usual["surprise"][0] < 1e-3  # the same motion again and again
     before = states.usual.copy()
