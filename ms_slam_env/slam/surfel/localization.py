@@ -23,6 +23,7 @@ from ms_slam_env.slam.shared.alignment_check import (
     status_on_appeal,
 )
 from ms_slam_env.slam.shared.feature_poses import FeaturePose, LastFrames
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.shared.state import Stateful, check_has
 from ms_slam_env.slam.surfel.acceptance import (
     FARTHEST_DEG,
@@ -38,7 +39,7 @@ from ms_slam_env.slam.surfel.acceptance import (
 )
 from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.free_space_mask import MotionMask
-from ms_slam_env.slam.surfel.keyframe_search import Images, Relocalization, measure_consistency
+from ms_slam_env.slam.surfel.keyframe_search import Relocalization, measure_consistency
 from ms_slam_env.slam.surfel.photometry import (
     InvalidFrameDetector,
     geometry_only,
@@ -363,7 +364,7 @@ class Localizer:
             is_guessed = np.isfinite(guesses[:, :1, :1])
             expected = np.where(is_guessed, guesses, expected)
         self._motion_mask.expect(live, expected, states.started & (states.lost == 0))
-        invalid = self.invalid_frames.find(frames.color, states.started)
+        invalid = self.invalid_frames.find(frames, states.started)
         self._feature_poses = {}
 
         def track() -> Alignment:
@@ -444,8 +445,8 @@ class Localizer:
     def _feature_pose(self, env: int, frames: Images) -> tuple[Float64, FeaturePose] | None:
         """Where (4, 4) the features of an env's last frame put the present one."""
         if env not in self._feature_poses:
-            images = frames.color[env], frames.depth[env]
-            found = self.last_frames.find(env, *images, self._config.depth_cutoff_m)
+            cutoff_m = self._config.depth_cutoff_m
+            found = self.last_frames.find(env, *frames.of(env), cutoff_m)
             self._feature_poses[env] = found
         return self._feature_poses[env]
 

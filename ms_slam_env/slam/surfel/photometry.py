@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.arrays import Bool
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
+from ms_slam_env.slam.shared.images import Images, Surveyor
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.surfel.device import (
     KernelLaunchCache,
@@ -25,7 +27,7 @@ from ms_slam_env.slam.surfel.device import (
     threads_per_row,
 )
 from ms_slam_env.slam.surfel.normal_equations import Photometry
-from ms_slam_env.slam.surfel.preprocessing import LiveFrame
+from ms_slam_env.slam.surfel.preprocessing import BAD_DEPTH, LiveFrame
 
 DTYPE: np.dtype[Any] = Photometry.numpy_dtype()  # type: ignore[attr-defined]
 SMALL_GAIN = 0.04  # a gain and a bias this near to none are left alone: a systematic error of
@@ -162,9 +164,13 @@ def is_invalid_frame(color: NDArray[np.uint8]) -> Bool:
     # Image by image OpenCV takes a tenth of the time of NumPy's sums over the whole batch.
     sampled = np.ascontiguousarray(color[:, ::_EVERY, ::_EVERY])
     statistics = np.array([cv2.meanStdDev(image) for image in sampled])  # (B, 2, 3, 1)
-    mean = statistics[:, 0].mean(axis=(1, 2))
-    spread = statistics[:, 1].max(axis=(1, 2))
-    extreme = (mean < _DARK) | (mean > _BRIGHT)
+    return _shows_nothing(statistics[:, 0, :, 0], statistics[:, 1, :, 0])
+
+
+def _shows_nothing(mean: NDArray[np.float64], deviation: NDArray[np.float64]) -> Bool:
+    """The same of images with these means and standard deviations (B, 3) of their colours."""
+    brightness, spread = mean.mean(axis=1), deviation.max(axis=1)
+    extreme = (brightness < _DARK) | (brightness > _BRIGHT)
     return (spread < _CONSTANT) | (extreme & (spread < _FAINT))
 
 
@@ -178,9 +184,20 @@ class InvalidFrameDetector(Saved):
 
     def __init__(self, batch: int) -> None:
         self.colorless = np.zeros(batch, dtype=bool)
+        self._survey = Surveyor(_EVERY)
 
-    def find(self, color: NDArray[np.uint8], started: Bool) -> Bool:
-        """Which frames (B, H, W, 3) are blank; the first of an env says whether it has colour."""
-        blank = is_invalid_frame(color)
+    def find(self, frames: Images, started: Bool) -> Bool:
+        """Which frames are blank (B,); the first of an env says whether it has colour.
+
+        Raises:
+            InputError: depth of frames on the device that is no depth; nothing has changed.
+        """
+        if frames.on_device:
+            mean, deviation, is_bad = self._survey(frames)
+            if is_bad.any():
+                raise InputError(f"{BAD_DEPTH} (env {np.flatnonzero(is_bad)[0]})")
+            blank = _shows_nothing(mean, deviation)
+        else:
+            blank = is_invalid_frame(frames.color)
         self.colorless = np.where(started, self.colorless, blank)
         return blank & ~self.colorless

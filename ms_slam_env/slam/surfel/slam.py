@@ -9,6 +9,7 @@ are stable.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,18 +21,19 @@ from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
 from ms_slam_env.slam.shared.ferns import Candidate
+from ms_slam_env.slam.shared.images import Images, images_of
 from ms_slam_env.slam.shared.state import Saved, check_has
 from ms_slam_env.slam.slam_backend import TrackResult
 from ms_slam_env.slam.surfel.acceptance import Alignment, doubt
 from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask
-from ms_slam_env.slam.surfel.keyframe_search import Images, make_relocalization
+from ms_slam_env.slam.surfel.keyframe_search import make_relocalization
 from ms_slam_env.slam.surfel.localization import CameraStates, Localizer, MapAligner
 from ms_slam_env.slam.surfel.loop_closure import make_loop_closure
 from ms_slam_env.slam.surfel.photometry import is_invalid_frame
 from ms_slam_env.slam.surfel.pipeline import Pipeline, PipelineCache, check_change
 from ms_slam_env.slam.surfel.pose_hypotheses import check_guesses, check_poses, motion_weight
-from ms_slam_env.slam.surfel.preprocessing import LiveFrame
+from ms_slam_env.slam.surfel.preprocessing import LiveFrame, count_readings
 from ms_slam_env.slam.surfel.rolling_shutter import Shutter
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
@@ -108,8 +110,8 @@ class BatchedSurfelSlam(Saved):
 
     def track(
         self,
-        color: NDArray[np.uint8],
-        depth: NDArray[np.float32],
+        color: Any,
+        depth: Any,
         T_world_camera_guess: Sequence[ArrayLike | None] | None = None,
         times_s: Sequence[float] | None = None,
     ) -> list[TrackResult]:
@@ -119,20 +121,27 @@ class BatchedSurfelSlam(Saved):
 
     def track_arrays(
         self,
-        color: NDArray[np.uint8],
-        depth: NDArray[np.float32],
+        color: Any,
+        depth: Any,
         T_world_camera_guess: Sequence[ArrayLike | None] | None = None,
         times_s: Sequence[float] | None = None,
     ) -> TrackedBatch:
-        """Track and fuse one frame per env: colour (B, H, W, 3) uint8, depth (B, H, W) metres.
+        """Track and fuse one frame per env.
 
-        ``T_world_camera_guess`` holds for every env a pose (4, 4) to start from too, or None;
-        ``times_s`` says when the frames were taken, without which no rolling shutter is undone.
-        The arrays of the result are the caller's own.
+        Args:
+            color: (B, H, W, 3) uint8; NumPy, or on the device, see ``images_of``: of such images
+                only those of envs that are lost, in doubt, or have a new keyframe with features
+                come to the host.
+            depth: (B, H, W) float32 metres, 0 = no reading; likewise.
+            T_world_camera_guess: for every env a pose (4, 4) to start from too, or None.
+            times_s: (B,) when the frames were taken, without which no rolling shutter is undone.
+
+        Returns:
+            Arrays that are the caller's own.
         """
         guesses = check_guesses(T_world_camera_guess, self.batch)
+        taken = images_of(color, depth, self.map.device)
         self._select_surfels(self._states.lost)
-        taken = Images(color, depth)
         frames = self._shutter.level(taken, self._states.motions)
         live = self.preprocess(frames.color, frames.depth)
         alignment = self._localizer.locate(live, frames, guesses)
@@ -141,16 +150,15 @@ class BatchedSurfelSlam(Saved):
             live, frames, alignment = self._unroll(taken, alignment)
         found = self._follow(live, alignment)
         self._correct_exposure(live, self._states.photometry)
-        self._last_frames.keep(
-            frames.color, self.motion_mask.still(frames.depth), self.poses, found.tracking_ok
-        )
+        still = Images(frames.color, self.motion_mask.still(frames.depth))
+        self._last_frames.keep(still, self.poses, found.tracking_ok)
         self._fuse(live, frames, found.fused)
         return self._close_loops(live, frames, found)
 
     def fuse(
         self,
-        color: NDArray[np.uint8],
-        depth: NDArray[np.float32],
+        color: Any,
+        depth: Any,
         T_world_camera: Float64,
         times_s: Sequence[float] | None = None,
     ) -> list[TrackResult]:
@@ -159,17 +167,17 @@ class BatchedSurfelSlam(Saved):
         motions = np.stack([invert(T) @ pose for T, pose in zip(states.poses, poses, strict=True)])
         motions[~states.started | (states.lost > 0)] = np.eye(4)
         self._shutter.take_time(times_s)
-        frames = self._shutter.level(Images(color, depth), motions)
+        frames = self._shutter.level(images_of(color, depth, self.map.device), motions)
         live = self.preprocess(frames.color, frames.depth)
         self._select_surfels(np.ones(self.batch, dtype=np.int32))  # known poses: old and new fit
-        self._invalid_frames.find(frames.color, states.started)
+        self._invalid_frames.find(frames, states.started)
         self.motion_mask.expect(live, poses, states.started)
         self.motion_mask.find(poses, states.started)
         states.follow(poses, motions)
         # With too little to see, the first frame that is tracked starts the map.
         states.start(~states.started & (_readings(live, ~states.started) >= FEWEST_READINGS))
         everywhere = np.ones(self.batch, dtype=bool)
-        self._last_frames.keep(frames.color, frames.depth, poses, everywhere)
+        self._last_frames.keep(frames, poses, everywhere)
         self._fuse(live, frames, everywhere)
         return [
             TrackResult(pose.copy(), True, moving=self.motion_mask.mask(env))
@@ -194,7 +202,7 @@ class BatchedSurfelSlam(Saved):
     def _map_first_again(self, motions: Float64, where: NDArray[np.bool_]) -> None:
         """Map the first frames of the envs ``where`` (B,) as levelled by the motions since."""
         if where.any():
-            frames = self._shutter.level(Images(*self._last_frames.images), motions)
+            frames = self._shutter.level(self._last_frames.images, motions)
             live = self.preprocess(frames.color, frames.depth)
             for env in np.flatnonzero(where):
                 self._forget_map(int(env))
@@ -317,8 +325,8 @@ class BatchedSurfelSlam(Saved):
 
     def shows_something(self, frames: Images, env: int = 0) -> bool:
         """Whether a map could start with an env's frame: it is not blank and has depth."""
-        blank = is_invalid_frame(frames.color[env : env + 1])[0]
-        readings = float((frames.depth[env] > 0).mean())
+        color, depth = frames.of(env)
+        blank, readings = is_invalid_frame(color[None])[0], float((depth > 0).mean())
         return readings >= FEWEST_READINGS and (not blank or self._invalid_frames.colorless[env])
 
     def get_state(self) -> dict[str, Any]:
@@ -343,6 +351,6 @@ class BatchedSurfelSlam(Saved):
 def _readings(live: LiveFrame, where: NDArray[np.bool_]) -> Float64:
     """Share of the pixels of frames that have depth (B,); 0 for envs other than ``where`` (B,)."""
     shares = np.zeros(len(where))
-    for env in map(int, np.flatnonzero(where)):
-        shares[env] = (live.depth[env].numpy() > 0).mean()
+    if where.any():
+        shares[where] = count_readings(live)[where] / math.prod(live.depth.shape[1:])
     return shares
