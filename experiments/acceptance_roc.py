@@ -24,6 +24,7 @@ from ms_slam_env.slam.shared.alignment_check import (
     TrackingStatus,
     status_on_appeal,
 )
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 from ms_slam_env.slam.surfel.acceptance import (
     Alignment,
@@ -31,7 +32,6 @@ from ms_slam_env.slam.surfel.acceptance import (
     fit_of_noise,
     is_nearly_accepted,
 )
-from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.submaps import FrameLookup
 
 RIGHT_M, RIGHT_RAD = 0.02, 0.02

@@ -114,12 +114,19 @@ class HostDeviceBuffer:
         self._values: NDArray[Any] = self.array.numpy()  # its memory on a CPU, otherwise a copy
         self._is_shared = wp.get_device(device).is_cpu
 
-    def write(self, values: ArrayLike) -> None:
+    def write(self, values: ArrayLike | wp.array) -> None:
         """Set all values, broadcast to the shape of the array.
+
+        Those of a Warp array are copied on the device; it must have the same shape and type.
 
         Raises:
             ValueError: values that cannot be broadcast to it.
         """
+        if isinstance(values, wp.array):
+            if (values.shape, values.dtype) != (self.array.shape, self.array.dtype):
+                raise ValueError(f"shape {values.shape} in place of {self.array.shape}")
+            wp.copy(self.array, values)
+            return
         np.copyto(self._values, values)
         if not self._is_shared:
             # With fewer values, `assign` would silently fill only the beginning of the array.

@@ -20,12 +20,14 @@ MODULES = (
     *("photometry", "pose_hypotheses", "preprocessing", "rendering", "rolling_shutter", "solver"),
     *("surfel_map", "surfel_update", "view_prediction"),
 )
+SHARED = ("device_ferns", "images")
 IN_REGISTERS = ("frustum_culling", "rendering", "surfel_update")
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", [*MODULES, *SHARED])
 def test_kernels_compile_for_a_gpu(name: str, tmp_path: Path) -> None:
-    module = importlib.import_module(f"ms_slam_env.slam.surfel.{name}")
+    place = "shared" if name in SHARED else "surfel"
+    module = importlib.import_module(f"ms_slam_env.slam.{place}.{name}")
     wp.compile_aot_module(module, arch=HOPPER, module_dir=str(tmp_path), use_ptx=True)
     [file] = tmp_path.glob("*.ptx")
     code = file.read_text()

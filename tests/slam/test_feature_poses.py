@@ -20,6 +20,7 @@ from ms_slam_env.geometry import (
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.shared import feature_poses
 from ms_slam_env.slam.shared.feature_poses import KeyframeImages, LastFrames
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.shared.point_poses import Sightings, refine_pose, sighting_covariance
 from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization
 
@@ -42,7 +43,8 @@ def start() -> np.ndarray:
 
 def _kept(frame: RGBDFrame, pose: np.ndarray) -> LastFrames:
     frames = LastFrames(1, CAMERA)
-    frames.keep(frame.color[None], frame.depth[None], pose[None], np.ones(1, dtype=bool))
+    images = Images(frame.color[None], frame.depth[None])
+    frames.keep(images, pose[None], np.ones(1, dtype=bool))
     return frames
 
 
@@ -96,8 +98,8 @@ def test_features_are_the_same_whether_they_were_sought_before_or_not(sensor, st
         assert (found is None) == (again is None)
         if found is not None:
             np.testing.assert_array_equal(found[0], again[0])
-        images = frames[k].color[None], frames[k].depth[None]
-        chain.keep(*images, start[None], np.ones(1, dtype=bool))
+        images = Images(frames[k].color[None], frames[k].depth[None])
+        chain.keep(images, start[None], np.ones(1, dtype=bool))
 
 
 def test_features_of_what_moves_are_left_out_of_the_last_frame(sensor, start):
@@ -107,7 +109,7 @@ def test_features_of_what_moves_are_left_out_of_the_last_frame(sensor, start):
     still[:, :80] = 0
     chain = _kept(frames[0], start)
     chain.find(0, frames[1].color, frames[1].depth, 8.0)
-    chain.keep(frames[1].color[None], still[None], start[None], np.ones(1, dtype=bool))
+    chain.keep(Images(frames[1].color[None], still[None]), start[None], np.ones(1, dtype=bool))
     found = chain.find(0, frames[2].color, frames[2].depth, 8.0)
     fresh = _kept(RGBDFrame(frames[1].color, still), start)
     again = fresh.find(0, frames[2].color, frames[2].depth, 8.0)

@@ -10,10 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.shared.device_ferns import DeviceFernEncoder
 from ms_slam_env.slam.shared.ferns import (
     MEAN_LEVEL,
     FernCode,
@@ -22,6 +24,7 @@ from ms_slam_env.slam.shared.ferns import (
     FernEncoder,
     dissimilarities,
 )
+from ms_slam_env.slam.shared.images import Images
 
 CAMERA = xtion("160x120")
 
@@ -192,3 +195,61 @@ def test_bad_input_is_refused(database, frames):
         FernConfig(num_ferns=0)
     with pytest.raises(InputError, match="near_m"):
         FernConfig(near_m=3.0, far_m=2.0)
+
+
+@pytest.mark.parametrize(
+    ("size", "blur_px", "exact"),
+    [
+        ("40x30", 1.0, True),
+        ("80x60", 1.0, True),  # OpenCV rounds means of 2x2 otherwise than those of more
+        ("160x120", 0.5, True),
+        ("640x480", 2.5, True),  # every second pixel
+        ("100x75", 1.0, False),  # no whole number of pixels for one
+        ("160x120", 12.0, False),  # blurred over more than the image
+    ],
+)
+def test_codes_are_the_same_on_the_device(frames, size, blur_px, exact):
+    camera, rng = xtion(size), np.random.default_rng(1)
+    color = np.stack(
+        [cv2.resize(frame.color, (camera.width, camera.height)) for frame in frames[:3]]
+        + [rng.integers(0, 256, (*camera.shape, 3), dtype=np.uint8)]
+    )
+    depth = rng.uniform(0, 4, color.shape[:3]).astype(np.float32)
+    depth[depth < 1] = 0
+    encoder = FernEncoder(camera, FernConfig(blur_px=blur_px), seed=2)
+    assert encoder.tests.run_on_device == exact
+    envs = np.array([3, 0, 2], dtype=np.int32)
+    found = [encoder.encode_all(Images(color, depth), envs)]
+    if exact:
+        there = Images(wp.array(color, dtype=wp.uint8), wp.array(depth, dtype=wp.float32))
+        on_device = DeviceFernEncoder(encoder.tests, len(color), "cpu")
+        found += [FernCode(*on_device.encode(there, envs)) for _ in range(2)]
+    for code in found:
+        for n, env in enumerate(envs):
+            alone = encoder.encode(color[env], depth[env])
+            np.testing.assert_array_equal(code.bits[n], alone.bits)
+            np.testing.assert_array_equal(code.known[n], alone.known)
+
+
+def test_many_databases_keep_at_once_what_each_keeps_alone(frames):
+    encoder = FernEncoder(CAMERA, FernConfig(), seed=3)
+    together, alone = ([FernDatabase(CAMERA, seed=3) for _ in range(70)] for _ in range(2))
+    rng, kept = np.random.default_rng(0), []
+    for step in range(4):
+        shown = rng.integers(0, len(frames), len(alone))
+        codes = [encoder.encode(frames[k].color, frames[k].depth) for k in shown]
+        poses = np.stack([_pose(ANGLES[k]) for k in shown])
+        times = np.arange(step, step + len(alone), dtype=np.int32)
+        stacked = FernCode(*(np.stack([getattr(c, n) for c in codes]) for n in ("bits", "known")))
+        found = FernDatabase.observe_codes(together, stacked, poses, times)
+        each = [
+            database.observe_code(code, pose, int(time))
+            for database, code, pose, time in zip(alone, codes, poses, times, strict=True)
+        ]
+        assert found.tolist() == each
+        kept.append(np.mean(each))
+    assert kept[0] == 1
+    assert 0 < kept[-1] < 1
+    for one, other in zip(together, alone, strict=True):
+        for name, values in one.get_state().items():
+            np.testing.assert_array_equal(values, other.get_state()[name])

@@ -176,15 +176,16 @@ def test_what_is_usual_follows_accepted_frames_only():
     found, _ = _frames().align(RIGHT[0], CONFIG)
     states = localization.CameraStates(1)
     cost = float(found.statistics["cost"][0])
-    states.accept(0, found, 1.0)
+    here = np.ones(1, dtype=bool)
+    states.accept(here, found, 1.0)
     assert states.usual["cost"][0] == pytest.approx(1 + 0.1 * (cost - 1))
     for _ in range(100):
-        states.accept(0, found, 1.0)
+        states.accept(here, found, 1.0)
     assert states.usual["cost"][0] == pytest.approx(cost, rel=1e-3)
     assert states.usual["surprise"][0] < 1e-3  # the same motion again and again
     before = states.usual.copy()
-    in_doubt = found.with_status(np.ones(1, dtype=bool), TrackingStatus.UNCERTAIN)
-    states.accept(0, in_doubt, 1.0)
+    in_doubt = found.with_status(here, TrackingStatus.UNCERTAIN)
+    states.accept(here, in_doubt, 1.0)
     assert states.usual == before
     states.reset(0, np.eye(4))
     assert states.usual == fit_of_noise(1)

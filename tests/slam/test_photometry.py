@@ -14,6 +14,7 @@ from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.geometry import make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.surfel.normal_equations import NUM_SUMS, RUNNING, Hypotheses, Photometry, Sum
 from ms_slam_env.slam.surfel.photometry import (
     ExposureCorrection,
@@ -99,12 +100,12 @@ def test_the_scale_is_that_of_cauchys_distribution(scale):
 def test_conflict_lowers_trust_and_agreement_restores_it():
     light = same_exposure(1)
     for _ in range(5):
-        light[0] = next_photometry(light[0], light[0], 5.0, 1.0)
+        light = next_photometry(light, light, np.array([5.0]), 1.0)
     assert light["trust"][0] == pytest.approx(0.2**5, rel=0.05)
     blind = geometry_only(light)
-    assert next_photometry(light[0], blind[0], 0.0, 1.0)["trust"] == light["trust"][0]
+    assert next_photometry(light, blind, np.zeros(1), 1.0)["trust"] == light["trust"]
     for _ in range(100):
-        light[0] = next_photometry(light[0], light[0], 0.1, 1.0)
+        light = next_photometry(light, light, np.array([0.1]), 1.0)
     assert light["trust"][0] == 1.0
 
 
@@ -205,11 +206,15 @@ def test_what_is_blank(mean, noise, blank):
 def test_only_where_the_first_frame_was_not():
     frames = InvalidFrameDetector(2)
     black, image = _image(0, 0), _image(100, 30)
-    started = np.zeros(2, dtype=bool)
-    np.testing.assert_array_equal(frames.find(np.stack([black, image]), started), [False, False])
+    started, depth = np.zeros(2, dtype=bool), np.ones((2, *black.shape[:2]), dtype=np.float32)
+
+    def blank(*colors: np.ndarray) -> list[bool]:
+        return frames.find(Images(np.stack(colors), depth), started).tolist()
+
+    assert blank(black, image) == [False, False]
     started[:] = True
-    np.testing.assert_array_equal(frames.find(np.stack([black, black]), started), [False, True])
-    np.testing.assert_array_equal(frames.find(np.stack([image, image]), started), [False, False])
+    assert blank(black, black) == [False, True]
+    assert blank(image, image) == [False, False]
 
 
 @pytest.mark.parametrize("depth_too", [True, False])

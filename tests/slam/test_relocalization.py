@@ -17,8 +17,10 @@ from ms_slam_env.geometry import look_at, make_pose, relative_angle, so3_exp
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.slam.shared.alignment_check import is_photometrically_consistent
 from ms_slam_env.slam.shared.alignment_measures import measure_photometric_consistency
+from ms_slam_env.slam.shared.ferns import FernCode
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
-from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization, Images
+from ms_slam_env.slam.surfel.keyframe_search import FernRelocalization
 
 CAMERA = xtion("160x120")
 OPTIONS = {"max_surfels": 120_000, "depth_cutoff_m": 4.0, "submaps": "off"}
@@ -160,10 +162,15 @@ def test_keyframes_follow_a_bent_map():
 
 def test_a_camera_at_rest_is_not_encoded_again(monkeypatch):
     ferns = FernRelocalization(2, CAMERA, 3.0)
-    seen = []
-    for env, database in enumerate(ferns.databases):
-        monkeypatch.setattr(database, "observe", lambda *_, env=env: seen.append(env))
-    nothing = Images(np.zeros((2, 4, 5, 3), np.uint8), np.zeros((2, 4, 5), np.float32))
+    seen, encode = [], ferns.databases[0].encoder.encode_all
+
+    def encode_all(images: Images, envs: np.ndarray) -> FernCode:
+        seen.extend(envs.tolist())
+        return encode(images, envs)
+
+    monkeypatch.setattr(ferns.databases[0].encoder, "encode_all", encode_all)
+    size = (2, *CAMERA.shape)
+    nothing = Images(np.zeros((*size, 3), np.uint8), np.zeros(size, np.float32))
     turns = np.radians([0.0, 2.0, 4.0, 5.0])  # of env 1
     for step, turn in zip([0.0, 0.02, 0.04, 0.06], turns, strict=True):
         poses = np.stack(

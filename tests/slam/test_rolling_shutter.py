@@ -12,7 +12,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, se3_exp
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.sequences import RollingShutter, render_sequence
-from ms_slam_env.slam.surfel.keyframe_search import Images
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.surfel.rolling_shutter import Shutter
 
 CAMERA = xtion("160x120")

@@ -20,8 +20,8 @@ from ms_slam_env.geometry import (
     transform_points,
 )
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.shared.submap_frames import SubmapLedger
-from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.submaps import MapFinder
 from ms_slam_env.slam.surfel.trajectory_history import DetachedMap
 

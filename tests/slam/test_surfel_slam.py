@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -11,10 +12,12 @@ import pytest
 from box_scene import BoxScene
 
 from ms_slam_env import slam
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import look_at, make_pose, so3_exp
 from ms_slam_env.sensor import RGBDSensor
+from ms_slam_env.slam.shared.alignment_check import TrackingStatus
 from ms_slam_env.slam.slam_backend import TrackResult
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 from ms_slam_env.slam.surfel.pose_hypotheses import motion_weight
@@ -58,7 +61,16 @@ def sequences(box_scene: BoxScene) -> list[list[tuple[RGBDFrame, np.ndarray]]]:
     return result
 
 
-def run(sequences: list[list[tuple[RGBDFrame, np.ndarray]]], envs: list[int]) -> dict[str, Any]:
+def on_device(images: np.ndarray) -> wp.array:
+    dtype = wp.uint8 if images.dtype == np.uint8 else wp.float32
+    return wp.array(images, dtype=dtype, device="cpu")
+
+
+def run(
+    sequences: list[list[tuple[RGBDFrame, np.ndarray]]],
+    envs: list[int],
+    given: Callable[[np.ndarray], Any] = np.asarray,
+) -> dict[str, Any]:
     """Results of every step, and maps and views at the end, of some envs in one batch."""
     slam = BatchedSurfelSlam(len(envs), CAMERA, CONFIG)
     for row, env in enumerate(envs):
@@ -68,8 +80,8 @@ def run(sequences: list[list[tuple[RGBDFrame, np.ndarray]]], envs: list[int]) ->
         for row, env in enumerate(envs):
             if (env, step) in RESET:
                 slam.reset(sequences[env][step][1], row)
-        color = np.stack([sequences[env][step][0].color for env in envs])
-        depth = np.stack([sequences[env][step][0].depth for env in envs])
+        color = given(np.stack([sequences[env][step][0].color for env in envs]))
+        depth = given(np.stack([sequences[env][step][0].depth for env in envs]))
         poses = np.stack([sequences[env][step][1] for env in envs])
         if step in FUSED:
             results.append(slam.fuse(color, depth, poses))
@@ -97,9 +109,12 @@ def alone(sequences) -> list[dict[str, Any]]:
     return [run(sequences, [env]) for env in range(ENVS)]
 
 
-@pytest.mark.parametrize("envs", [[0, 1], [4, 2, 3, 1, 0]])
-def test_a_batch_does_what_its_envs_do_alone(sequences, alone, envs):
-    together = run(sequences, envs)
+@pytest.mark.parametrize(
+    ("envs", "given"),
+    [([0, 1], np.asarray), ([4, 2, 3, 1, 0], np.asarray), ([4, 2, 3, 1, 0], on_device)],
+)
+def test_a_batch_does_what_its_envs_do_alone(sequences, alone, envs, given):
+    together = run(sequences, envs, given)
     for row, env in enumerate(envs):
         single = alone[env]
         for step in range(STEPS):
@@ -118,6 +133,30 @@ def test_a_batch_does_what_its_envs_do_alone(sequences, alone, envs):
             np.testing.assert_array_equal(
                 together["state"][name][row], single["state"][name][0], err_msg=name
             )
+
+
+def test_arrays_hold_what_results_say(sequences):
+    """And they are the caller's own: later frames leave them as they are."""
+    pair = [BatchedSurfelSlam(2, CAMERA, CONFIG) for _ in range(2)]
+    arrays, results = [], []
+    for step in range(6):
+        frames = [sequences[env][step][0] for env in (0, 1)]  # env 1 is black from step 3 on
+        color, depth = (np.stack([getattr(f, name) for f in frames]) for name in ("color", "depth"))
+        arrays.append(pair[0].track_arrays(color, depth))
+        results.append(pair[1].track(color, depth))
+    for found, row in zip(arrays, results, strict=True):
+        names = ("T_world_camera", "tracking_ok", "uncertain", "relocalised", "inlier_fraction")
+        for name in (*names, "residual_m", "overlap", "degenerate_directions", "fused"):
+            expected = [getattr(result, name) for result in row]
+            np.testing.assert_array_equal(getattr(found, name), expected, err_msg=name)
+        for env, result in enumerate(row):
+            is_known = result.covariance is not None
+            assert np.isfinite(found.covariance[env]).all() == is_known
+            if is_known:
+                np.testing.assert_array_equal(found.covariance[env], result.covariance)
+    assert arrays[0].is_first.all()
+    assert not arrays[1].is_first.any()
+    assert arrays[4].status.tolist() == [TrackingStatus.OK, TrackingStatus.BLANK]
 
 
 def test_the_envs_differ_in_what_they_do(alone):
@@ -148,6 +187,17 @@ def test_bad_input_is_refused(arc_frames):
     for images in ((color[:, 1:], depth[:, 1:]), (color, depth[:, 1:]), (color[0], depth[0])):
         with pytest.raises(InputError, match=r"must be \(1, 120, 160, 3\)"):
             batched.track(*images)
+    for bad in (np.nan, np.inf, -1.0):
+        there = on_device(color), on_device(np.where(depth == depth.max(), np.float32(bad), depth))
+        with pytest.raises(InputError, match="depth holds"):
+            batched.track(*there)
+    for images in ((on_device(color), depth), (color, on_device(depth))):
+        with pytest.raises(InputError, match="must both be"):
+            batched.track(*images)
+    with pytest.raises(InputError, match="must be NumPy arrays"):
+        batched.track(color.tolist(), depth.tolist())
+    with pytest.raises(InputError, match="float32, not uint8"):
+        batched.track(on_device(depth), on_device(depth))
     with pytest.raises(InputError, match="surfel"):
         slam.make("orb", CAMERA)
     with pytest.raises(InputError, match="iterations"):

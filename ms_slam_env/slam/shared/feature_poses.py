@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.arrays import Float32, Float64
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.slam.shared.feature_matching import match_anywhere
+from ms_slam_env.slam.shared.images import Images, ImageStore
 from ms_slam_env.slam.shared.orb_features import FeatureExtractor, Features, InverseDepth
 from ms_slam_env.slam.shared.point_poses import (
     Sightings,
@@ -154,12 +155,12 @@ class KeyframeImages(FrameFeatures, Saved):
 class LastFrames(Saved):
     """The last frame with a known pose of each of B envs; features are extracted on request."""
 
-    saved = ("_color", "_depth", "_poses")
+    saved = ("_poses",)
+    also_saved = ("color", "depth")
 
     def __init__(self, batch: int, intrinsics: Intrinsics) -> None:
         self._poses: Float64 = np.full((batch, 4, 4), np.nan)
-        self._depth: Float32 = np.zeros((batch, 0, 0), dtype=np.float32)
-        self._color = np.zeros((batch, 0, 0, 3), dtype=np.uint8)
+        self._stored = ImageStore(batch, (0, 0))
         self.use(intrinsics)
 
     def use(self, intrinsics: Intrinsics) -> None:
@@ -167,32 +168,24 @@ class LastFrames(Saved):
         self._frames = FrameFeatures(intrinsics)
         self._known: dict[int, Features] = {}  # of the last frames
         self._seen: dict[int, tuple[NDArray[np.uint8], Float32, Features]] = {}  # asked for since
-        size = (len(self._poses), *intrinsics.shape)
-        if self._depth.shape != size:
+        if self.images.depth.shape[1:] != intrinsics.shape:
             self._poses[:] = np.nan
-            self._depth = np.zeros(size, dtype=np.float32)
-            self._color = np.zeros((*size, 3), dtype=np.uint8)
+            self._stored = ImageStore(len(self._poses), intrinsics.shape)
 
-    def keep(
-        self,
-        color: NDArray[np.uint8],
-        depth: Float32,
-        T_world_camera: Float64,
-        known: NDArray[np.bool_],
-    ) -> None:
-        """Store the frames (B, H, W) of the envs whose poses (B, 4, 4) are ``known`` (B,)."""
-        for env in map(int, np.flatnonzero(known)):
-            self._color[env], self._depth[env] = color[env], depth[env]
-            self._poses[env] = T_world_camera[env]
+    def keep(self, images: Images, T_world_camera: Float64, known: NDArray[np.bool_]) -> None:
+        """Store the images of the envs whose poses (B, 4, 4) are ``known`` (B,)."""
+        self._stored.replace(images, known)
+        self._poses[known] = T_world_camera[known]
+        for env in [env for env in {**self._known, **self._seen} if known[env]]:
             self._known.pop(env, None)
-            if env in self._seen and self._is_seen(env, color[env], depth[env]):
+            if env in self._seen and self._is_seen(env, *images.of(env)):
                 self._known[env] = self._seen[env][-1]
         self._seen = {}
 
     @property
-    def images(self) -> tuple[NDArray[np.uint8], Float32]:
-        """Colour (B, H, W, 3) and depth (B, H, W) of the frames."""
-        return self._color, self._depth
+    def images(self) -> Images:
+        """The frames."""
+        return self._stored.images
 
     def move(self, env: int, T_world_camera: Float64) -> None:
         """Move an env's frame to another pose (4, 4)."""
@@ -203,9 +196,21 @@ class LastFrames(Saved):
         self._poses[env] = np.nan
         self._known.pop(env, None)
 
+    def get_state(self) -> dict[str, Any]:
+        """The images and their poses."""
+        images = self.images.on_host()
+        own = {"color": images.color.copy(), "depth": images.depth.copy()}
+        return own | super().get_state()
+
+    def state_like(self) -> Any:
+        """See ``Stateful``."""
+        return self.get_state()
+
     def set_state(self, state: dict[str, Any]) -> None:
         """Go on from a state; features are sought anew."""
         super().set_state(state)
+        everywhere = np.ones(len(self._poses), dtype=bool)
+        self._stored.replace(Images(state["color"], state["depth"]), everywhere)
         self._known, self._seen = {}, {}
 
     def _is_seen(self, env: int, color: NDArray[np.uint8], depth: Float32) -> bool:
@@ -221,7 +226,7 @@ class LastFrames(Saved):
             return None
         of = self._frames.features_of
         if env not in self._known:
-            self._known[env] = of(self._color[env], self._depth[env], cutoff_m)
+            self._known[env] = of(*self.images.of(env), cutoff_m)
         if env not in self._seen or not self._is_seen(env, color, depth):
             self._seen[env] = color, depth, of(color, depth, cutoff_m)
         before, now = self._known[env], self._seen[env][-1]

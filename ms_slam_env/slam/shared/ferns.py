@@ -7,24 +7,29 @@ compares red, green, blue and depth at one place of a small, smoothed image with
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env._runtime.arrays import Float64, UInt8
+from ms_slam_env._runtime.arrays import Bool, Float64, Int32, UInt8
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
+from ms_slam_env.slam.shared.device_ferns import FernTests
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.shared.state import Stateful
 from ms_slam_env.slam.shared.state_check import ArrayOf
 
 _THRESHOLDS = (32.0, 224.0)  # on colours, at mean brightness ``MEAN_LEVEL``
 _AVERAGED = 8  # least rows and columns of the image that a reduced pixel averages
 _FIRST_ROWS = 64
+_COMPARED = 64  # databases whose keyframes are compared at once
 
 
 @dataclass(frozen=True)
@@ -64,13 +69,17 @@ MEAN_LEVEL = 128.0  # mean brightness that frames are normalised to before the t
 class FernCode:
     """The code of one frame."""
 
-    bits: UInt8  # (F,) outcome of the four tests of each fern
+    bits: UInt8  # (F,) outcome of the four tests of each fern; (N, F) of several frames
     # (F,) which of the four bits are known; the depth bit is not where there is no reading.
     known: UInt8
 
 
 class FernEncoder:
-    """Encodes frames of one camera; test positions and thresholds are drawn from a seed."""
+    """Encodes frames of one camera; test positions and thresholds are drawn from a seed.
+
+    Attributes:
+        tests: what ``DeviceFernEncoder`` needs to do the same.
+    """
 
     def __init__(self, intrinsics: Intrinsics, config: FernConfig, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
@@ -89,6 +98,17 @@ class FernEncoder:
         v = ((row + 0.5) * height / rows).astype(np.int64)
         u = ((column + 0.5) * width / columns).astype(np.int64)
         self._depth_place = v * width + u
+        self.tests = FernTests(
+            image=intrinsics.shape,
+            reduced=(rows, columns),
+            step=self._step,
+            blur_px=config.blur_px,
+            mean_level=MEAN_LEVEL,
+            color_place=self._color_place,
+            depth_place=self._depth_place,
+            color_thresholds=self.color_thresholds,
+            depth_thresholds=self.depth_thresholds,
+        )
 
     @property
     def tested_size(self) -> tuple[int, int]:
@@ -101,17 +121,37 @@ class FernEncoder:
         Colours are divided by the frame's mean brightness, so a change of exposure changes no bit
         except where the image saturates.
         """
+        return self._code(self._reduced(color), depth)
+
+    def encode_all(self, images: Images, envs: Int32) -> FernCode:
+        """The codes (N, F) of the frames of ``envs`` (N,)."""
+        frames = [images.of(env) for env in envs.tolist()]
+        small = np.stack([self._reduced(color) for color, _ in frames])
+        return self._code(small, np.stack([depth for _, depth in frames]))
+
+    def _reduced(self, color: UInt8) -> UInt8:
+        """The smoothed image (h, w, 3) that is tested."""
         thinned = np.ascontiguousarray(color[:: self._step, :: self._step])
         small = cv2.resize(thinned, self._size, interpolation=cv2.INTER_AREA)
-        small = cv2.GaussianBlur(small, (0, 0), self._blur_px)
-        tested = small.reshape(-1, 3)[self._color_place]
-        brightness = max(float(np.mean(small)), 1.0)
-        above = tested > self.color_thresholds * (brightness / MEAN_LEVEL)
-        reading = depth.reshape(-1)[self._depth_place]
+        return np.asarray(cv2.GaussianBlur(small, (0, 0), self._blur_px))
+
+    def _code(self, small: UInt8, depth: NDArray[np.float32]) -> FernCode:
+        """Code (..., F) of tested images (..., h, w, 3) and depth (..., H, W)."""
+        several = small.shape[:-3]
+        tested = small.reshape(*several, -1, 3)[..., self._color_place, :]
+        mean = small.mean(axis=(-3, -2, -1), keepdims=True)[..., 0]
+        above = tested > self.color_thresholds * (np.maximum(mean, 1.0) / MEAN_LEVEL)
+        reading = depth.reshape(*several, -1)[..., self._depth_place]
         bits = above @ np.array([1, 2, 4], dtype=np.uint8)
         bits |= (reading > self.depth_thresholds).astype(np.uint8) << 3
         known = np.where(reading > 0, COLOUR_BITS | DEPTH_BIT, COLOUR_BITS).astype(np.uint8)
         return FernCode(bits, known)
+
+
+@lru_cache(maxsize=8)
+def fern_encoder(intrinsics: Intrinsics, config: FernConfig, seed: int) -> FernEncoder:
+    """An encoder that databases share: it holds nothing but what it was drawn from."""
+    return FernEncoder(intrinsics, config, seed)
 
 
 def dissimilarities(code: FernCode, bits: UInt8, known: UInt8) -> Float64:
@@ -148,7 +188,7 @@ class FernDatabase(Stateful):
     ) -> None:
         self.config = config or FernConfig()
         self._seed = seed
-        self._encoder = FernEncoder(intrinsics, self.config, seed)
+        self._encoder = fern_encoder(intrinsics, self.config, seed)
         self.clear()
 
     def __len__(self) -> int:
@@ -179,13 +219,18 @@ class FernDatabase(Stateful):
         Raises:
             InputError: another aspect ratio, or smaller than the reduced image.
         """
-        encoder = FernEncoder(intrinsics, self.config, self._seed)
+        encoder = fern_encoder(intrinsics, self.config, self._seed)
         if encoder.tested_size != self._encoder.tested_size:
             raise InputError(
                 f"frames of {intrinsics.width}x{intrinsics.height} have other ferns: they test "
                 f"{encoder.tested_size} in place of {self._encoder.tested_size} pixels"
             )
         self._encoder = encoder
+
+    @property
+    def encoder(self) -> FernEncoder:
+        """Encodes frames for methods that take a code."""
+        return self._encoder
 
     def encode(self, color: UInt8, depth: NDArray[np.float32]) -> FernCode:
         """Encode a frame for methods that take a code: colour (H, W, 3), depth (H, W) metres."""
@@ -202,6 +247,10 @@ class FernDatabase(Stateful):
         pose = check_pose(T_world_camera, "T_world_camera")
         if self._count and self.dissimilarities(code).min() <= self.config.keyframe_dissimilarity:
             return False
+        self._append(code, pose, time)
+        return True
+
+    def _append(self, code: FernCode, pose: Float64, time: int) -> None:
         if self._count == len(self._bits):
             for name in _ROWS:  # double the capacity
                 setattr(self, name, _with_more_rows(getattr(self, name)))
@@ -209,7 +258,6 @@ class FernDatabase(Stateful):
         self._bits[row], self._known[row] = code.bits, code.known
         self._poses[row], self._times[row] = pose, time
         self._count += 1
-        return True
 
     def candidates(
         self, color: UInt8, depth: NDArray[np.float32], count: int, before: int | None = None
@@ -243,6 +291,34 @@ class FernDatabase(Stateful):
     def dissimilarities(self, code: FernCode) -> Float64:
         """Share of ferns (K,) at which each keyframe differs from a frame."""
         return dissimilarities(code, self._bits[: self._count], self._known[: self._count])
+
+    @staticmethod
+    def observe_codes(
+        databases: Sequence[FernDatabase], codes: FernCode, poses: Float64, times: Int32
+    ) -> Bool:
+        """``observe_code`` for a frame of each of N databases, compared at once.
+
+        ``codes`` are (N, F), ``poses`` (N, 4, 4), ``times`` (N,). Returns which were kept (N,).
+        """
+        kept = np.zeros(len(databases), dtype=bool)
+        for first in range(0, len(databases), _COMPARED):
+            group = databases[first : first + _COMPARED]
+            counts = np.array([len(database) for database in group])
+            which = np.repeat(np.arange(len(group)), counts)
+            bits, known = (
+                np.concatenate([getattr(one, name)[: len(one)] for one in group])
+                for name in ("_bits", "_known")
+            )
+            own = slice(first, first + len(group))
+            code = FernCode(codes.bits[own][which], codes.known[own][which])
+            is_similar = (
+                dissimilarities(code, bits, known) <= group[0].config.keyframe_dissimilarity
+            )
+            kept[own] = np.bincount(which, is_similar, len(group)) == 0
+        for k in np.flatnonzero(kept).tolist():
+            code = FernCode(codes.bits[k], codes.known[k])
+            databases[k]._append(code, check_pose(poses[k], "poses"), int(times[k]))
+        return kept
 
     def move(self, poses: ArrayLike) -> None:
         """Move all keyframes to new poses (K, 4, 4), after a loop closure has deformed the map."""

@@ -236,11 +236,13 @@ def fit_of_noise(batch: int) -> NDArray[Any]:
     return usual
 
 
-def follow_usual(usual: np.void, statistics: np.void, surprise: float) -> None:
-    """Learn, in place, from a frame that was accepted."""
-    found = {name: float(statistics[name]) for name in _FIT}
-    for name, value in (found | {"surprise": surprise}).items():
-        usual[name] += _FOLLOWS * (value - usual[name])
+def follow_usual(usual: NDArray[Any], statistics: NDArray[Any], surprise: Float64) -> NDArray[Any]:
+    """What is ``usual`` (B,) after frames that were accepted, with these figures (B,)."""
+    after = usual.copy()
+    for name in _FIT:
+        after[name] += _FOLLOWS * (statistics[name] - usual[name])
+    after["surprise"] += _FOLLOWS * (surprise - usual["surprise"])
+    return after
 
 
 def at_usual_noise(thresholds: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any]:
@@ -354,9 +356,9 @@ def is_nearly_accepted(
     return alignment.status_under(relaxed, env) == TrackingStatus.OK
 
 
-def with_doubt(covariance: Float64, frames: int) -> Float64:
-    """Covariance (6, 6) of a pose that has been uncertain for a number of frames."""
-    return covariance + frames * np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
+def doubt(frames: NDArray[np.int32]) -> Float64:
+    """What is added to the covariances (B, 6, 6) of poses uncertain for ``frames`` (B,)."""
+    return frames[:, None, None] * np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
 
 
 def accept_any_fit(alignment: Alignment) -> Alignment:

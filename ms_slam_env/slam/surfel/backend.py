@@ -12,11 +12,11 @@ from ms_slam_env.camera import Intrinsics, RGBDFrame, check_frame
 from ms_slam_env.camera.frame import reduce_color, reduce_depth
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import check_pose
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.shared.state import check_has
 from ms_slam_env.slam.shared.submap_frames import Submaps
 from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult, Views, check_views
 from ms_slam_env.slam.surfel.color_cameras import EstimatedColorCamera
-from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.submaps import AtlasSubmaps
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig

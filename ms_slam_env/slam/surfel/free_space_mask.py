@@ -283,6 +283,18 @@ def enlarge(masked: wp.array[wp.int32], grid: Grid, image: wp.array[wp.int32]) -
         column += 1
 
 
+@wp.kernel
+def leave_out(
+    depth: wp.array3d[wp.float32],  # (B, H, W)
+    masked: wp.array3d[wp.int32],  # (B, h, w) of the grid
+    step: wp.int32,  # pixels of the image for one of the grid
+    left: wp.array3d[wp.float32],
+) -> None:
+    """Depth without the masked readings."""
+    b, v, u = wp.tid()
+    left[b, v, u] = wp.where(masked[b, v / step, u / step] != 0, 0.0, depth[b, v, u])
+
+
 class MotionMask(Saved):
     """Tells which readings of the live frames of B envs belong to things that move.
 
@@ -346,8 +358,8 @@ class MotionMask(Saved):
         """Every n-th row and column (h, w) of an env's mask; None if nothing is ever masked."""
         return None
 
-    def still(self, depth: Float32) -> Float32:
-        """Depth images (B, H, W) without the readings of what moves."""
+    def still(self, depth: Any) -> Any:
+        """Depth images (B, H, W), NumPy or on the device, without the readings of what moves."""
         return depth
 
 
@@ -637,14 +649,25 @@ class GeometricMotionMask(MotionMask):
         """See the base class."""
         return self._masked.read()[env] > 0
 
-    def still(self, depth: Float32) -> Float32:
+    def still(self, depth: Any) -> Any:
         """See the base class."""
-        masked = self._masked.read() > 0
-        if not masked.any():
+        if not self._moves_now.any():
             return depth
+        if isinstance(depth, wp.array):
+            return self._still_on_device(depth)
+        masked = self._masked.look() > 0
         step = -(-depth.shape[1] // masked.shape[1])
         whole = masked.repeat(step, axis=1).repeat(step, axis=2)
         return np.where(whole[:, : depth.shape[1], : depth.shape[2]], np.float32(0), depth)
+
+    def _still_on_device(self, depth: wp.array) -> wp.array:
+        """The same of images on the device."""
+        batch, height, width = depth.shape
+        step = -(-height // self._grid.height)
+        left = wp.empty_like(depth)
+        inputs = [depth, self._masked.array, step, left]
+        wp.launch(leave_out, (batch, height, width), inputs, device=self._device)
+        return left
 
 
 def _flat(*buffers: SavedBuffer) -> list[wp.array]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -15,8 +14,16 @@ from ms_slam_env.slam.shared.alignment_check import (
     is_photometrically_consistent,
 )
 from ms_slam_env.slam.shared.alignment_measures import measure_photometric_consistency
+from ms_slam_env.slam.shared.device_ferns import DeviceFernEncoder
 from ms_slam_env.slam.shared.feature_poses import KeyframeImages, pose_from_features
-from ms_slam_env.slam.shared.ferns import Candidate, FernConfig, FernDatabase, dissimilarities
+from ms_slam_env.slam.shared.ferns import (
+    Candidate,
+    FernCode,
+    FernConfig,
+    FernDatabase,
+    dissimilarities,
+)
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.surfel.acceptance import Alignment, acceptance_thresholds
 from ms_slam_env.slam.surfel.pose_hypotheses import (
@@ -28,14 +35,6 @@ from ms_slam_env.slam.surfel.pose_hypotheses import (
 )
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.surfel_config import AcceptanceConfig, SurfelConfig
-
-
-@dataclass(frozen=True)
-class Images:
-    """Frames as sensed."""
-
-    color: NDArray[np.uint8]  # (B, H, W, 3) uint8
-    depth: NDArray[np.float32]  # (B, H, W) float32 metres; 0 = no reading
 
 
 class FrameAligner(Protocol):
@@ -61,13 +60,11 @@ def measure_consistency(
     if not wanted.any():
         return {}
     view = aligner.render(np.where(wanted[:, None, None], poses, np.eye(4)))
-    intensity, depth = view.intensity.numpy(), view.vertices.numpy()[..., 2]
-    return {
-        int(env): measure_photometric_consistency(
-            frames.color[env], frames.depth[env], intensity[env], depth[env], cutoff_m
-        )
-        for env in np.flatnonzero(wanted)
-    }
+    found = {}
+    for env in np.flatnonzero(wanted).tolist():
+        seen = view.intensity[env].numpy(), view.vertices[env].numpy()[..., 2]
+        found[env] = measure_photometric_consistency(*frames.of(env), *seen, cutoff_m)
+    return found
 
 
 class Relocalization(Saved):
@@ -189,6 +186,7 @@ class FernRelocalization(Relocalization):
             far_m=min(max(depth_cutoff_m, 2 * FernConfig.near_m), _FARTHEST_TESTED_M)
         )
         self.databases = [FernDatabase(intrinsics, config) for _ in range(batch)]
+        self._device_encoder: DeviceFernEncoder | None = None
         self._cutoff_m = depth_cutoff_m
         acceptance = acceptance or AcceptanceConfig()
         self._strict = _strict_thresholds(acceptance, 0)
@@ -203,10 +201,24 @@ class FernRelocalization(Relocalization):
         self._attempts[tracked] = 0
         moved = tracked & _has_moved(self._looked_from, poses)
         self._looked_from[moved] = poses[moved]
-        for env in np.flatnonzero(moved):
-            color, depth, now = frames.color[env], frames.depth[env], int(time[env])
-            if self.databases[env].observe(color, depth, poses[env], now):
-                self._keep(int(env), frames, now)
+        envs = np.flatnonzero(moved).astype(np.int32)
+        if not len(envs):
+            return
+        databases = [self.databases[env] for env in envs]
+        codes = self._encode(frames, envs)
+        kept = FernDatabase.observe_codes(databases, codes, poses[envs], time[envs])
+        for env in envs[kept].tolist():
+            self._keep(env, frames, int(time[env]))
+
+    def _encode(self, frames: Images, envs: Int32) -> FernCode:
+        """Codes (N, F) of the frames of ``envs`` (N,), encoded where they lie."""
+        encoder = self.databases[0].encoder
+        if not (frames.on_device and encoder.tests.run_on_device):
+            return encoder.encode_all(frames, envs)
+        if self._device_encoder is None or self._device_encoder.tests is not encoder.tests:
+            batch, device = len(self.databases), str(frames.depth.device)
+            self._device_encoder = DeviceFernEncoder(encoder.tests, batch, device)
+        return FernCode(*self._device_encoder.encode(frames, envs))
 
     def _keep(self, env: int, frames: Images, time: int) -> None:
         """Take note of a new keyframe."""
@@ -280,7 +292,7 @@ class FernRelocalization(Relocalization):
         """Poses (TRIALS, B, 4, 4) of keyframes, NaN for none; others at every attempt."""
         poses = np.full((TRIALS, len(lost), 4, 4), np.nan)
         for env in np.flatnonzero(lost):
-            near = self.databases[env].candidates(frames.color[env], frames.depth[env], _LOOKED_AT)
+            near = self.databases[env].candidates(*frames.of(int(env)), _LOOKED_AT)
             first = TRIALS * int(attempts[env] % ROUNDS)
             apart = _spread(near, first + TRIALS)
             chosen = apart[first:] or apart[:TRIALS]
@@ -290,8 +302,8 @@ class FernRelocalization(Relocalization):
 
     def similar(self, env: int, frames: Images, before: int) -> list[Candidate]:
         """At most ``TRIALS``, apart from each other."""
-        color, depth = frames.color[env], frames.depth[env]
-        return _spread(self.databases[env].candidates(color, depth, _LOOKED_AT, before), TRIALS)
+        near = self.databases[env].candidates(*frames.of(env), _LOOKED_AT, before)
+        return _spread(near, TRIALS)
 
     def move_keyframes(self, env: int, time: Int32, poses: Float64) -> None:
         """Put the keyframes where their frames are now."""
@@ -321,7 +333,7 @@ class FernRelocalization(Relocalization):
 
     def least_dissimilarity(self, env: int, frames: Images, keyframes: dict[str, Any]) -> float:
         """See the base class."""
-        code = self.databases[env].encode(frames.color[env], frames.depth[env])
+        code = self.databases[env].encode(*frames.of(env))
         found = dissimilarities(code, keyframes["bits"], keyframes["known"])
         return float(found.min(initial=np.inf))
 
@@ -359,7 +371,7 @@ class FeatureRelocalization(FernRelocalization):
         self._images = [KeyframeImages(intrinsics) for _ in range(batch)]
 
     def _keep(self, env: int, frames: Images, time: int) -> None:
-        self._images[env].keep(frames.color[env], frames.depth[env], time)
+        self._images[env].keep(*frames.of(env), time)
 
     def propose(
         self, frames: Images, lost: Bool, attempts: Int32, aligner: FrameAligner
@@ -375,7 +387,7 @@ class FeatureRelocalization(FernRelocalization):
     def _by_features(self, env: int, frames: Images, attempt: int) -> Float64:
         """Pose (4, 4) that most features speak for; NaN: none."""
         images, best, pose = self._images[env], FEWEST_MATCHES, np.full((4, 4), np.nan)
-        color, depth = frames.color[env], frames.depth[env]
+        color, depth = frames.of(env)
         near = self.databases[env].candidates(color, depth, _LOOKED_AT)
         known = _spread([one for one in near if one.time in images.times], TRIALS * ROUNDS)
         first = TRIALS * (attempt % ROUNDS)

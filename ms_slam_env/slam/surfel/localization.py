@@ -23,6 +23,7 @@ from ms_slam_env.slam.shared.alignment_check import (
     status_on_appeal,
 )
 from ms_slam_env.slam.shared.feature_poses import FeaturePose, LastFrames
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.shared.state import Stateful, check_has
 from ms_slam_env.slam.surfel.acceptance import (
     FARTHEST_DEG,
@@ -38,7 +39,7 @@ from ms_slam_env.slam.surfel.acceptance import (
 )
 from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.free_space_mask import MotionMask
-from ms_slam_env.slam.surfel.keyframe_search import Images, Relocalization, measure_consistency
+from ms_slam_env.slam.surfel.keyframe_search import Relocalization, measure_consistency
 from ms_slam_env.slam.surfel.photometry import (
     InvalidFrameDetector,
     geometry_only,
@@ -108,36 +109,39 @@ class CameraStates(Stateful):
             array[env] = getattr(fresh, name)[0]
         self._own["poses"][env] = pose
 
-    def start(self, env: int) -> None:
-        """Take note that an env has a first frame."""
-        self._own["started"][env] = True
+    def start(self, where: NDArray[np.bool_]) -> None:
+        """Take note that the envs ``where`` (B,) have a first frame."""
+        self._own["started"][where] = True
 
-    def accept(self, env: int, alignment: Alignment, least_scale: float) -> None:
-        """Move on to where the frame was tracked."""
+    def accept(self, where: NDArray[np.bool_], alignment: Alignment, least_scale: float) -> None:
+        """Move the envs ``where`` (B,) on to where their frames were tracked."""
         own = self._own
-        own["poses"][env] = alignment.T_world_live[env]
-        if alignment.tracked[env]:
-            surprise = _surprise(alignment.T_model_live, self.motions)[env]
-            follow_usual(own["usual"][env], alignment.statistics[env], float(surprise))
+        sure = where & alignment.tracked
+        surprise = _surprise(alignment.T_model_live, self.motions)[sure]
+        own["usual"][sure] = follow_usual(self.usual[sure], alignment.statistics[sure], surprise)
+        own["poses"][where] = alignment.T_world_live[where]
         # Across a gap the motion is not one frame's.
-        motion = np.eye(4) if self.lost[env] else alignment.T_model_live[env]
+        is_next = where & (self.lost == 0)
+        own["motions"][where] = np.eye(4)
+        own["motions"][is_next] = alignment.T_model_live[is_next]
         # What a degenerate view leaves open was predicted itself: let it die away.
-        is_degenerate = alignment.statistics[env]["degenerate_directions"] > 0
-        own["motions"][env] = damped(motion) if is_degenerate else motion
-        own["lost"][env] = 0
-        own["doubted"][env] = self.doubted[env] + 1 if alignment.uncertain[env] else 0
-        own["photometry"][env] = next_photometry(
-            self.photometry[env],
-            alignment.photometry[env],
-            float(alignment.statistics[env]["term_conflict"]),
+        is_open = alignment.statistics["degenerate_directions"] > 0
+        for env in np.flatnonzero(where & is_open):
+            own["motions"][env] = damped(self.motions[env])
+        own["doubted"][where] = np.where(alignment.uncertain, self.doubted + 1, 0)[where]
+        own["lost"][where] = 0
+        own["photometry"][where] = next_photometry(
+            self.photometry[where],
+            alignment.photometry[where],
+            alignment.statistics["term_conflict"][where],
             least_scale,
         )
 
-    def hold(self, env: int) -> None:
-        """Stay where the frame was not tracked."""
-        self._own["motions"][env] = np.eye(4)
-        self._own["lost"][env] += 1
-        self._own["doubted"][env] = 0
+    def hold(self, where: NDArray[np.bool_]) -> None:
+        """Leave the envs ``where`` (B,) as their frames were not tracked."""
+        self._own["motions"][where] = np.eye(4)
+        self._own["lost"][where] += 1
+        self._own["doubted"][where] = 0
 
     def follow(self, poses: Float64, motions: Float64) -> None:
         """Take known poses (B, 4, 4) and the motions (B, 4, 4) that led there."""
@@ -235,14 +239,9 @@ class MapAligner:
         """Align with the views from the last poses; a lost env searches wider at every frame."""
         states = self._states
         lost = states.lost > 0
-        hypotheses = np.stack(
-            [
-                relocalization_hypotheses(int(frames_lost) - 1)
-                if frames_lost
-                else tracking_hypotheses(motion)
-                for motion, frames_lost in zip(states.motions, states.lost, strict=True)
-            ]
-        )
+        hypotheses = tracking_hypotheses(states.motions)
+        for env in np.flatnonzero(lost):
+            hypotheses[env] = relocalization_hypotheses(int(states.lost[env]) - 1)
         thresholds = self._thresholds(lost)
         alignment = self._align(states.poses, hypotheses, thresholds, states.photometry, guesses)
         alignment = alignment.with_status(invalid, TrackingStatus.BLANK)
@@ -365,7 +364,7 @@ class Localizer:
             is_guessed = np.isfinite(guesses[:, :1, :1])
             expected = np.where(is_guessed, guesses, expected)
         self._motion_mask.expect(live, expected, states.started & (states.lost == 0))
-        invalid = self.invalid_frames.find(frames.color, states.started)
+        invalid = self.invalid_frames.find(frames, states.started)
         self._feature_poses = {}
 
         def track() -> Alignment:
@@ -446,8 +445,8 @@ class Localizer:
     def _feature_pose(self, env: int, frames: Images) -> tuple[Float64, FeaturePose] | None:
         """Where (4, 4) the features of an env's last frame put the present one."""
         if env not in self._feature_poses:
-            images = frames.color[env], frames.depth[env]
-            found = self.last_frames.find(env, *images, self._config.depth_cutoff_m)
+            cutoff_m = self._config.depth_cutoff_m
+            found = self.last_frames.find(env, *frames.of(env), cutoff_m)
             self._feature_poses[env] = found
         return self._feature_poses[env]
 

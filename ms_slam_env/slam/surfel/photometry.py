@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from ms_slam_env._runtime.arrays import Bool
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
+from ms_slam_env.errors import InputError
+from ms_slam_env.slam.shared.images import Images, Surveyor
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.surfel.device import (
     KernelLaunchCache,
@@ -25,7 +27,7 @@ from ms_slam_env.slam.surfel.device import (
     threads_per_row,
 )
 from ms_slam_env.slam.surfel.normal_equations import Photometry
-from ms_slam_env.slam.surfel.preprocessing import LiveFrame
+from ms_slam_env.slam.surfel.preprocessing import BAD_DEPTH, LiveFrame
 
 DTYPE: np.dtype[Any] = Photometry.numpy_dtype()  # type: ignore[attr-defined]
 SMALL_GAIN = 0.04  # a gain and a bias this near to none are left alone: a systematic error of
@@ -61,24 +63,30 @@ def geometry_only(photometry: NDArray[Any]) -> NDArray[Any]:
 
 
 def next_photometry(
-    before: np.void, frame: np.void, conflict: float, least_scale: float
-) -> np.void:
-    """Photometry of an env after a frame was tracked with ``before`` and ended as ``frame``.
+    before: NDArray[Any], frame: NDArray[Any], conflict: NDArray[np.float64], least_scale: float
+) -> NDArray[Any]:
+    """Photometry (B,) after frames were tracked with ``before`` and ended as ``frame``.
 
-    ``conflict`` is chi squared between the poses that depth and grey values ask for. A recording
-    whose colour and depth are not registered has much of it, again and again; its grey values are
-    trusted less until the two agree within what is left of the photometric term's certainty.
+    ``conflict`` (B,) is chi squared between the poses that depth and grey values ask for. A
+    recording whose colour and depth are not registered has much of it, again and again; its grey
+    values are trusted less until the two agree within what is left of the photometric term's
+    certainty.
     """
     after = frame.copy()
-    share = max(1.0, USUAL_SCALE * float(frame["scale"]) / least_scale)
-    usual = float(before["reference"])
-    after["reference"] = share if share > usual else usual + SCALE_FALLS * (share - usual)
-    trust = float(before["trust"])
-    if frame["trust"] > 0.0:  # else grey values had no say, and nothing was learnt about them
-        falls = max(TRUST_FALLS, LARGEST_CONFLICT / max(conflict, LARGEST_CONFLICT))
-        trust *= falls if conflict > LARGEST_CONFLICT else TRUST_GROWS
-    after["trust"] = min(1.0, max(LEAST_TRUST, trust))
+    share = at_least(1.0, USUAL_SCALE * frame["scale"].astype(np.float64) / least_scale)
+    usual = before["reference"].astype(np.float64)
+    after["reference"] = np.where(share > usual, share, usual + SCALE_FALLS * (share - usual))
+    falls = at_least(TRUST_FALLS, LARGEST_CONFLICT / at_least(LARGEST_CONFLICT, conflict))
+    change = np.where(conflict > LARGEST_CONFLICT, falls, TRUST_GROWS)
+    # Without trust grey values had no say, and nothing was learnt about them.
+    trust = before["trust"].astype(np.float64) * np.where(frame["trust"] > 0.0, change, 1.0)
+    after["trust"] = np.minimum(1.0, at_least(LEAST_TRUST, trust))
     return after
+
+
+def at_least(least: float, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The values, but ``least`` where they are less, or no number."""
+    return np.where(values > least, values, least)
 
 
 def is_leap(before: NDArray[Any], frame: NDArray[Any], least_scale: float) -> Bool:
@@ -156,9 +164,13 @@ def is_invalid_frame(color: NDArray[np.uint8]) -> Bool:
     # Image by image OpenCV takes a tenth of the time of NumPy's sums over the whole batch.
     sampled = np.ascontiguousarray(color[:, ::_EVERY, ::_EVERY])
     statistics = np.array([cv2.meanStdDev(image) for image in sampled])  # (B, 2, 3, 1)
-    mean = statistics[:, 0].mean(axis=(1, 2))
-    spread = statistics[:, 1].max(axis=(1, 2))
-    extreme = (mean < _DARK) | (mean > _BRIGHT)
+    return _shows_nothing(statistics[:, 0, :, 0], statistics[:, 1, :, 0])
+
+
+def _shows_nothing(mean: NDArray[np.float64], deviation: NDArray[np.float64]) -> Bool:
+    """The same of images with these means and standard deviations (B, 3) of their colours."""
+    brightness, spread = mean.mean(axis=1), deviation.max(axis=1)
+    extreme = (brightness < _DARK) | (brightness > _BRIGHT)
     return (spread < _CONSTANT) | (extreme & (spread < _FAINT))
 
 
@@ -172,9 +184,20 @@ class InvalidFrameDetector(Saved):
 
     def __init__(self, batch: int) -> None:
         self.colorless = np.zeros(batch, dtype=bool)
+        self._survey = Surveyor(_EVERY)
 
-    def find(self, color: NDArray[np.uint8], started: Bool) -> Bool:
-        """Which frames (B, H, W, 3) are blank; the first of an env says whether it has colour."""
-        blank = is_invalid_frame(color)
+    def find(self, frames: Images, started: Bool) -> Bool:
+        """Which frames are blank (B,); the first of an env says whether it has colour.
+
+        Raises:
+            InputError: depth of frames on the device that is no depth; nothing has changed.
+        """
+        if frames.on_device:
+            mean, deviation, is_bad = self._survey(frames)
+            if is_bad.any():
+                raise InputError(f"{BAD_DEPTH} (env {np.flatnonzero(is_bad)[0]})")
+            blank = _shows_nothing(mean, deviation)
+        else:
+            blank = is_invalid_frame(frames.color)
         self.colorless = np.where(started, self.colorless, blank)
         return blank & ~self.colorless

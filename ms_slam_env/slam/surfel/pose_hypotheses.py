@@ -35,11 +35,15 @@ _TURNS = np.stack(
 
 
 def tracking_hypotheses(last_motion: Float64) -> Float64:
-    """Starts T_model_live (NUM_HYPOTHESES, 4, 4): at rest, at constant velocity, turned six ways.
+    """Starts T_model_live (..., NUM_HYPOTHESES, 4, 4) after motions (..., 4, 4).
 
-    A turn stands for a sideways step too: both shift the image.
+    At rest, at constant velocity, turned six ways. A turn stands for a sideways step too: both
+    shift the image.
     """
-    return np.concatenate([np.eye(4)[None], last_motion[None], _TURNS])
+    starts = np.empty((*last_motion.shape[:-2], NUM_HYPOTHESES, 4, 4))
+    starts[..., AT_REST, :, :], starts[..., CONSTANT_VELOCITY, :, :] = np.eye(4), last_motion
+    starts[..., NUM_FIRST:, :, :] = _TURNS
+    return starts
 
 
 def relocalization_hypotheses(attempt: int) -> Float64:

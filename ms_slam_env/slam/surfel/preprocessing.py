@@ -272,10 +272,12 @@ class Preprocessor:
         self._dim = (batch * intrinsics.height, threads)
         self._stages = self._record()
 
-    def __call__(self, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> LiveFrame:
+    def __call__(self, color: Any, depth: Any) -> LiveFrame:
         """Preprocess colour (B, H, W, 3) uint8 and depth (B, H, W) float32 m into one LiveFrame.
 
-        The frame's buffers are those of the last call.
+        Images are NumPy arrays or lie on the device, see ``Images``; of those depth is not looked
+        at for values that are none: they count as no reading. The frame's buffers are those of the
+        last call.
         """
         check_images(color, depth, self._raw_depth.array.shape)
         self._raw_color.write(color)
@@ -306,16 +308,43 @@ class Preprocessor:
         return [RecordedLaunch(kernel, dim, inputs, self.device) for kernel, inputs in stages]
 
 
-def check_images(
-    color: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, ...]
+@wp.kernel
+def _count_readings(
+    depth: wp.array[wp.float32],
+    height: wp.int32,
+    width: wp.int32,
+    counts: wp.array[wp.int32],  # (B,)
 ) -> None:
-    """Refuse another ``size`` than (B, H, W), and depth that is no depth."""
-    if color.shape != (*size, 3) or depth.shape != size:
+    """Count the pixels that have depth, a row a thread."""
+    row = wp.tid()
+    found = wp.int32(0)
+    i = row * width
+    while i < (row + 1) * width:
+        found += wp.where(fetch(depth, i) > 0.0, 1, 0)
+        i += 1
+    wp.atomic_add(counts, row / height, found)
+
+
+def count_readings(live: LiveFrame) -> NDArray[np.int32]:
+    """Pixels (B,) of the frames that have depth."""
+    batch, height, width = live.depth.shape
+    counts = wp.zeros(batch, dtype=wp.int32, device=live.depth.device)
+    inputs = [live.depth.flatten(), height, width, counts]
+    wp.launch(_count_readings, batch * height, inputs, device=live.depth.device)
+    return np.asarray(counts.numpy())
+
+
+BAD_DEPTH = "depth holds NaN, infinite or negative values; 0 means no reading"
+
+
+def check_images(color: Any, depth: Any, size: tuple[int, ...]) -> None:
+    """Refuse another ``size`` than (B, H, W), and on the host depth that is no depth."""
+    if tuple(color.shape) != (*size, 3) or tuple(depth.shape) != size:
         raise InputError(
             f"colour {color.shape} and depth {depth.shape} must be {(*size, 3)} and {size}"
         )
-    if not (depth.min() >= 0 and depth.max() < np.inf):
-        raise InputError("depth holds NaN, infinite or negative values; 0 means no reading")
+    if isinstance(depth, np.ndarray) and not (depth.min() >= 0 and depth.max() < np.inf):
+        raise InputError(BAD_DEPTH)
 
 
 EDGE_FRACTION = 0.03  # pixels of a block further behind the front one than this are another surface

@@ -27,9 +27,9 @@ from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import se3_log
 from ms_slam_env.native import native_source
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.surfel.device import SavedBuffer
-from ms_slam_env.slam.surfel.keyframe_search import Images
 from ms_slam_env.slam.surfel.preprocessing import check_images
 
 PIECE = 64  # columns that are worked on together, by short loops over several of them at once
@@ -92,14 +92,20 @@ class _Leveller:
         self._launch = RecordedLaunch(_level, dim, [rows, *levelled], device)
 
     def __call__(self, frames: Images, twists: Float64) -> Images:
-        """Level frames that were read while the cameras moved by ``twists`` (B, 6)."""
+        """Level frames that were read while the cameras moved by ``twists`` (B, 6).
+
+        Images on the device are overwritten by the next call.
+        """
         check_images(frames.color, frames.depth, self._depth.array.shape)
         self._color.write(frames.color)
         self._depth.write(frames.depth)
         self._turn.write(twists[:, 3:])
         self._step.write(twists[:, :3])
         self._launch.launch()
-        return Images(self._levelled_color.read(), self._levelled_depth.read())
+        levelled = self._levelled_color, self._levelled_depth
+        if frames.on_device:
+            return Images(*(buffer.array for buffer in levelled))
+        return Images(*(buffer.read() for buffer in levelled))
 
 
 class Shutter(Saved):

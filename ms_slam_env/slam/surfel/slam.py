@@ -9,8 +9,8 @@ are stable.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,23 +20,24 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
-from ms_slam_env.slam.shared.alignment_check import MAP_REASONS, TrackingStatus
 from ms_slam_env.slam.shared.ferns import Candidate
+from ms_slam_env.slam.shared.images import Images, images_of
 from ms_slam_env.slam.shared.state import Saved, check_has
 from ms_slam_env.slam.slam_backend import TrackResult
-from ms_slam_env.slam.surfel.acceptance import Alignment, with_doubt
+from ms_slam_env.slam.surfel.acceptance import Alignment, doubt
 from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask
-from ms_slam_env.slam.surfel.keyframe_search import Images, make_relocalization
+from ms_slam_env.slam.surfel.keyframe_search import make_relocalization
 from ms_slam_env.slam.surfel.localization import CameraStates, Localizer, MapAligner
 from ms_slam_env.slam.surfel.loop_closure import make_loop_closure
 from ms_slam_env.slam.surfel.photometry import is_invalid_frame
 from ms_slam_env.slam.surfel.pipeline import Pipeline, PipelineCache, check_change
 from ms_slam_env.slam.surfel.pose_hypotheses import check_guesses, check_poses, motion_weight
-from ms_slam_env.slam.surfel.preprocessing import LiveFrame
+from ms_slam_env.slam.surfel.preprocessing import LiveFrame, count_readings
 from ms_slam_env.slam.surfel.rolling_shutter import Shutter
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
+from ms_slam_env.slam.surfel.tracked_batch import TrackedBatch, tracked_batch
 from ms_slam_env.slam.surfel.tracker import model_stride
 from ms_slam_env.slam.surfel.trajectory_history import DetachedMap
 
@@ -109,38 +110,55 @@ class BatchedSurfelSlam(Saved):
 
     def track(
         self,
-        color: NDArray[np.uint8],
-        depth: NDArray[np.float32],
+        color: Any,
+        depth: Any,
         T_world_camera_guess: Sequence[ArrayLike | None] | None = None,
         times_s: Sequence[float] | None = None,
     ) -> list[TrackResult]:
-        """Track and fuse one frame per env: colour (B, H, W, 3) uint8, depth (B, H, W) metres.
+        """Track and fuse one frame per env, with a result for each; see ``track_arrays``."""
+        found = self.track_arrays(color, depth, T_world_camera_guess, times_s)
+        return found.results(self.motion_mask.mask)
 
-        ``T_world_camera_guess`` holds for every env a pose (4, 4) to start from too, or None;
-        ``times_s`` says when the frames were taken, without which no rolling shutter is undone.
+    def track_arrays(
+        self,
+        color: Any,
+        depth: Any,
+        T_world_camera_guess: Sequence[ArrayLike | None] | None = None,
+        times_s: Sequence[float] | None = None,
+    ) -> TrackedBatch:
+        """Track and fuse one frame per env.
+
+        Args:
+            color: (B, H, W, 3) uint8; NumPy, or on the device, see ``images_of``: of such images
+                only those of envs that are lost, in doubt, or have a new keyframe with features
+                come to the host.
+            depth: (B, H, W) float32 metres, 0 = no reading; likewise.
+            T_world_camera_guess: for every env a pose (4, 4) to start from too, or None.
+            times_s: (B,) when the frames were taken, without which no rolling shutter is undone.
+
+        Returns:
+            Arrays that are the caller's own.
         """
         guesses = check_guesses(T_world_camera_guess, self.batch)
+        taken = images_of(color, depth, self.map.device)
         self._select_surfels(self._states.lost)
-        taken = Images(color, depth)
         frames = self._shutter.level(taken, self._states.motions)
         live = self.preprocess(frames.color, frames.depth)
         alignment = self._localizer.locate(live, frames, guesses)
         self._shutter.take_time(times_s)
         if self._shutter.is_rolling:
             live, frames, alignment = self._unroll(taken, alignment)
-        results = [self._follow(env, live, alignment) for env in range(self.batch)]
+        found = self._follow(live, alignment)
         self._correct_exposure(live, self._states.photometry)
-        known = np.array([result.tracking_ok for result in results])
-        self._last_frames.keep(
-            frames.color, self.motion_mask.still(frames.depth), self.poses, known
-        )
-        self._fuse(live, frames, np.array([result.fused for result in results]))
-        return self._close_loops(live, frames, results)
+        still = Images(frames.color, self.motion_mask.still(frames.depth))
+        self._last_frames.keep(still, self.poses, found.tracking_ok)
+        self._fuse(live, frames, found.fused)
+        return self._close_loops(live, frames, found)
 
     def fuse(
         self,
-        color: NDArray[np.uint8],
-        depth: NDArray[np.float32],
+        color: Any,
+        depth: Any,
         T_world_camera: Float64,
         times_s: Sequence[float] | None = None,
     ) -> list[TrackResult]:
@@ -149,19 +167,17 @@ class BatchedSurfelSlam(Saved):
         motions = np.stack([invert(T) @ pose for T, pose in zip(states.poses, poses, strict=True)])
         motions[~states.started | (states.lost > 0)] = np.eye(4)
         self._shutter.take_time(times_s)
-        frames = self._shutter.level(Images(color, depth), motions)
+        frames = self._shutter.level(images_of(color, depth, self.map.device), motions)
         live = self.preprocess(frames.color, frames.depth)
         self._select_surfels(np.ones(self.batch, dtype=np.int32))  # known poses: old and new fit
-        self._invalid_frames.find(frames.color, states.started)
+        self._invalid_frames.find(frames, states.started)
         self.motion_mask.expect(live, poses, states.started)
         self.motion_mask.find(poses, states.started)
         states.follow(poses, motions)
-        for env in np.flatnonzero(~states.started):
-            # With too little to see, the first frame that is tracked starts the map.
-            if _readings(int(env), live) >= FEWEST_READINGS:
-                states.start(int(env))
+        # With too little to see, the first frame that is tracked starts the map.
+        states.start(~states.started & (_readings(live, ~states.started) >= FEWEST_READINGS))
         everywhere = np.ones(self.batch, dtype=bool)
-        self._last_frames.keep(frames.color, frames.depth, poses, everywhere)
+        self._last_frames.keep(frames, poses, everywhere)
         self._fuse(live, frames, everywhere)
         return [
             TrackResult(pose.copy(), True, moving=self.motion_mask.mask(env))
@@ -186,53 +202,27 @@ class BatchedSurfelSlam(Saved):
     def _map_first_again(self, motions: Float64, where: NDArray[np.bool_]) -> None:
         """Map the first frames of the envs ``where`` (B,) as levelled by the motions since."""
         if where.any():
-            frames = self._shutter.level(Images(*self._last_frames.images), motions)
+            frames = self._shutter.level(self._last_frames.images, motions)
             live = self.preprocess(frames.color, frames.depth)
             for env in np.flatnonzero(where):
                 self._forget_map(int(env))
             self._states.count(-1)
             self._fuse(live, frames, where)
 
-    def _follow(self, env: int, live: LiveFrame, alignment: Alignment) -> TrackResult:
-        """Pose of a live frame: given for the first, tracked or searched for the others."""
-        started = self._states.started[env]
-        return self._move_on(env, alignment) if started else self._start(env, live)
+    def _follow(self, live: LiveFrame, alignment: Alignment) -> TrackedBatch:
+        """Poses of the live frames: given for the first, tracked or searched for the others.
 
-    def _start(self, env: int, live: LiveFrame) -> TrackResult:
-        """Take the first frame at the given pose, if there is something in it to map."""
-        pose = self.poses[env].copy()
-        if _readings(env, live) < FEWEST_READINGS:
-            reason = "the first frame has too few depth readings"
-            return TrackResult(pose, False, inlier_fraction=0.0, reason=reason, overlap=0.0)
-        self._states.start(env)
-        return TrackResult(pose, True, moving=self.motion_mask.mask(env))
-
-    def _move_on(self, env: int, alignment: Alignment) -> TrackResult:
-        """Take the pose of a frame that was tracked, else hold the last one."""
-        status, states = TrackingStatus(alignment.status[env]), self._states
-        uncertain = status == TrackingStatus.UNCERTAIN
-        tracked = uncertain or status == TrackingStatus.OK
-        covariance = alignment.covariance[env]
-        if uncertain:
-            covariance = with_doubt(covariance, 1 + int(states.doubted[env]))
-        relocalised = tracked and bool(states.lost[env])
-        if tracked:
-            states.accept(env, alignment, self.config.cauchy_rgb)
-        else:
-            states.hold(env)
-        return TrackResult(
-            T_world_camera=states.poses[env].copy(),
-            tracking_ok=tracked,
-            relocalised=relocalised,
-            inlier_fraction=float(alignment.statistics[env]["inlier_ratio"]),
-            residual_m=float(alignment.statistics[env]["residual_m"]),
-            reason=MAP_REASONS[status],
-            degenerate_directions=int(alignment.statistics[env]["degenerate_directions"]),
-            covariance=covariance if tracked else None,
-            uncertain=uncertain,
-            overlap=float(alignment.statistics[env]["overlap"]),
-            moving=self.motion_mask.mask(env),
-        )
+        Where a frame was not tracked the last pose is held. A first frame is taken if there is
+        something in it to map.
+        """
+        states = self._states
+        started, lost, doubted = states.started.copy(), states.lost > 0, states.doubted.copy()
+        begins = ~started & (_readings(live, ~started) >= FEWEST_READINGS)
+        states.start(begins)
+        tracked = started & (alignment.tracked | alignment.uncertain)
+        states.accept(tracked, alignment, self.config.cauchy_rgb)
+        states.hold(started & ~tracked)
+        return tracked_batch(alignment, started, begins, lost, states.poses, doubt(1 + doubted))
 
     def _fuse(self, live: LiveFrame, frames: Images, good: NDArray[np.bool_]) -> None:
         """Fuse the frames with a good pose; a fast camera's readings weigh less."""
@@ -249,26 +239,23 @@ class BatchedSurfelSlam(Saved):
             self.aligner.forget_view()
         states.count()
 
-    def _close_loops(
-        self, live: LiveFrame, frames: Images, results: list[TrackResult]
-    ) -> list[TrackResult]:
-        """Close loops after fusion; a closed one corrects the map and the pose."""
+    def _close_loops(self, live: LiveFrame, frames: Images, found: TrackedBatch) -> TrackedBatch:
+        """Close loops after fusion; a closed one corrects the map and the pose, and ``found``."""
 
         def similar(env: int, before: int) -> list[Candidate]:
             return self.relocalization.similar(env, frames, before)
 
-        tracked = np.array([result.fused for result in results])
-        closed = self.loops.close(live, self.poses, self._states.time - 1, tracked, similar)
+        closed = self.loops.close(live, self.poses, self._states.time - 1, found.fused, similar)
         for env, (loop, pose) in closed.items():
-            results[env] = replace(results[env], loop=loop)
+            found.loops[env] = loop
             if not loop.bent:
                 continue
             self._states.move_to(env, pose)
             self._last_frames.move(env, pose)
             self.relocalization.move_keyframes(env, *self.loops.trajectory(env))
             self.motion_mask.forget(env)  # the map and the earlier frames no longer agree
-            results[env] = replace(results[env], T_world_camera=pose.copy(), loop_closed=True)
-        return results
+            found.T_world_camera[env], found.loop_closed[env] = pose, True
+        return found
 
     # -- Maps that come and go ---------------------------------------------------------------
 
@@ -320,7 +307,7 @@ class BatchedSurfelSlam(Saved):
     def mark_lost(self, env: int = 0) -> None:
         """Seek an env's next frame in its map, whatever the light is by now."""
         if self._states.started[env]:
-            self._states.hold(env)
+            self._states.hold(np.arange(self.batch) == env)
             self._states.forget_exposure(env)
             self.motion_mask.forget(env)
 
@@ -338,8 +325,8 @@ class BatchedSurfelSlam(Saved):
 
     def shows_something(self, frames: Images, env: int = 0) -> bool:
         """Whether a map could start with an env's frame: it is not blank and has depth."""
-        blank = is_invalid_frame(frames.color[env : env + 1])[0]
-        readings = float((frames.depth[env] > 0).mean())
+        color, depth = frames.of(env)
+        blank, readings = is_invalid_frame(color[None])[0], float((depth > 0).mean())
         return readings >= FEWEST_READINGS and (not blank or self._invalid_frames.colorless[env])
 
     def get_state(self) -> dict[str, Any]:
@@ -361,6 +348,9 @@ class BatchedSurfelSlam(Saved):
         self.aligner.forget_view()
 
 
-def _readings(env: int, live: LiveFrame) -> float:
-    """Share of a frame's pixels that have depth."""
-    return float((live.depth[env].numpy() > 0).mean())
+def _readings(live: LiveFrame, where: NDArray[np.bool_]) -> Float64:
+    """Share of the pixels of frames that have depth (B,); 0 for envs other than ``where`` (B,)."""
+    shares = np.zeros(len(where))
+    if where.any():
+        shares[where] = count_readings(live)[where] / math.prod(live.depth.shape[1:])
+    return shares

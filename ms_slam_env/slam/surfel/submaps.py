@@ -21,13 +21,14 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.geometry import invert, se3_exp, se3_log
 from ms_slam_env.slam.shared.alignment_check import AlignmentStatistics
+from ms_slam_env.slam.shared.images import Images
 from ms_slam_env.slam.shared.map_fit import FitConfig, measure_fit, why_not_believed
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.shared.state_check import Fields, ListOf, OrNone, WholeNumber
 from ms_slam_env.slam.shared.submap_frames import SubmapLedger, Submaps
 from ms_slam_env.slam.slam_backend import TrackResult, Views
 from ms_slam_env.slam.surfel.acceptance import Alignment
-from ms_slam_env.slam.surfel.keyframe_search import Images, measure_consistency
+from ms_slam_env.slam.surfel.keyframe_search import measure_consistency
 from ms_slam_env.slam.surfel.pose_hypotheses import is_within, tracking_hypotheses
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.surfel_config import SubmapConfig
