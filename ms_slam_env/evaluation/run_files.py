@@ -44,11 +44,11 @@ def write_frames(path: Path, run: SequenceRun) -> None:
     columns |= alignment_columns(run)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["timestamp", "tracking_ok", *columns, "reason"])
+    writer.writerow(["timestamp", "tracking_ok", *columns, "reason", "refusal"])
     for index, (timestamp, result) in enumerate(zip(run.timestamps, run.results, strict=True)):
         values = (_number(name, values[index]) for name, values in columns.items())
-        words = [f"{timestamp:.6f}", int(result.tracking_ok), *values, result.reason]
-        writer.writerow(words)
+        said = result.reason, result.refusal
+        writer.writerow([f"{timestamp:.6f}", int(result.tracking_ok), *values, *said])
     write_text(path, text.getvalue())
 
 

@@ -147,4 +147,5 @@ def _depth(frame: RGBDFrame) -> NDArray[np.floating]:
 def _heading(index: int, result: TrackResult) -> str:
     figures_of = f"overlap {result.overlap:.0%}, inliers {result.inlier_fraction:.0%}"
     residual = "" if math.isnan(result.residual_m) else f", {1e3 * result.residual_m:.1f} mm"
-    return f"First refused frame, {index}: {result.reason} ({figures_of}{residual})"
+    refusal = f"{result.refusal}; " if result.refusal else ""
+    return f"First refused frame, {index}: {result.reason} ({refusal}{figures_of}{residual})"

@@ -55,6 +55,8 @@ class TrackResult:
         residual_m: RMS point-to-plane residual of the inliers, metres.
         overlap: share of the frame's readings that land on the view it was aligned with.
         reason: why tracking failed, in words; empty if it succeeded.
+        refusal: the figure behind ``reason`` and what was demanded, as in "cost 1.61, at most
+            1.42"; empty if nothing was refused, or not for a figure.
         loop_closed: whether this frame closed a loop: the map was deformed, and the pose jumped by
             the corrected drift.
         loop: the loop that was found, even if it nearly fitted and the map was not deformed; None
@@ -103,6 +105,7 @@ class TrackResult:
     submap: int = 0
     submaps_joined: bool = False
     moving: NDArray[np.bool_] | None = None
+    refusal: str = ""
 
 
 @dataclass(frozen=True)

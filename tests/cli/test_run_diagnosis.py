@@ -58,6 +58,7 @@ def test_lost_frames_say_why(holed_run):
     results = [step.result for step in own]
     assert [row["reason"] for row in rows] == [result.reason for result in results]
     assert rows[6]["reason"]
+    assert [row["refusal"] for row in rows] == [result.refusal for result in results]
     for key in ("inlier_fraction", "overlap", "degenerate_directions"):
         expected = [getattr(result, key) for result in results]
         assert [float(row[key]) for row in rows] == pytest.approx(expected, abs=1e-3)

@@ -22,6 +22,7 @@ from ms_slam_env.slam.shared.alignment_check import (
     TrackingStatus,
     evaluate_alignment,
     evaluate_on_device,
+    failed_demand,
     status_on_appeal,
 )
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, measure_alignment, overlay
@@ -80,6 +81,29 @@ def test_what_does_not_fit_is_named():
     near = DepthImage(reference.depth * np.float32(0.8), reference.intensity)
     found = measure_alignment(near, reference, REST, CAMERA)
     assert evaluate_alignment(found, VIEW_THRESHOLDS) == TrackingStatus.GEOMETRIC_MISMATCH
+
+
+_FIELDS = [field.name for field in fields(AcceptanceThresholds)]
+
+
+@given(
+    found=st.fixed_dictionaries({name: st.sampled_from([0.0, 0.4, 0.6, 1.0]) for name in _FIELDS}),
+    demanded=st.fixed_dictionaries({}, optional={name: st.just(0.5) for name in _FIELDS}),
+)
+def test_a_refusal_names_a_figure_whose_repair_changes_the_decision(found, demanded):
+    statistics, thresholds = AlignmentStatistics(**found), AcceptanceThresholds(**demanded)
+    status = evaluate_alignment(statistics, thresholds)
+    said = failed_demand(statistics, thresholds, status)
+    assert bool(said) == (status != TrackingStatus.OK)
+    record = np.array(
+        [tuple(getattr(statistics, name) for name in _FIELDS)], thresholds.repeated(1).dtype
+    )
+    assert failed_demand(record[0], thresholds.repeated(1)[0], status) == said
+    if said:
+        assert said.endswith(" 0.5")
+        value = float(said.split(",")[0].split()[-1])
+        assert value > 0.5 if "at most" in said else value < 0.5
+        assert failed_demand(statistics, AcceptanceThresholds(), status) == ""
 
 
 def test_pixels_without_a_reading_count_neither_way():

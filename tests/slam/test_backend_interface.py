@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -38,6 +39,12 @@ ACCURACY_M = {
 }
 """Largest error of position on the noisy path of 0.11 m."""
 
+
+REFUSED_FOR = {
+    **dict.fromkeys(("surfel", MANAGED), "points 0, at least 100"),
+    "volumetric": r"inliers 0\.[0-5]\d*, at least 0\.6",
+}
+"""Pattern of what refuses a frame from elsewhere; the others find no motion to judge."""
 
 SLIDES_M = {"kinectfusion": 0.04}
 """What is granted besides where geometry says little: its alignment is of geometry alone."""
@@ -234,7 +241,9 @@ def test_a_frame_from_elsewhere_is_not_called_tracked(name, frames, box_scene):
     for frame in frames[:3]:
         backend.track(frame)
     elsewhere = _capture(box_scene, look_at([-0.5, 0.5, 1.2], [-1.5, -1.5, 0.6]))
-    assert not backend.track(elsewhere).tracking_ok
+    result = backend.track(elsewhere)
+    assert not result.tracking_ok
+    assert re.fullmatch(REFUSED_FOR.get(name, ""), result.refusal)
 
 
 def test_a_guess_finds_a_distant_pose(name, frames, box_scene):

@@ -202,9 +202,9 @@ class OdometrySlam(BorrowedMap, FrameByFrameSlam[DepthImage, _Placed]):
             reason = "no motion aligns the frame with the view before it"
             return Attempt(reference.T_world_image, NO_ALIGNMENT, reason, reference)
         images = frame.image, reference.prepared.image
-        found, reason = check_alignment(*images, T, self.intrinsics, thresholds)
+        found, *refused = check_alignment(*images, T, self.intrinsics, thresholds)
         pose = reference.T_world_image @ T
-        return Attempt(pose, found, reason, _Placed(pose, frame))
+        return Attempt(pose, found, refused[0], _Placed(pose, frame), refused[1])
 
     def _start_from(self, frame: RGBDFrame, prepared: DepthImage) -> None:
         if prepared.readings >= self.fewest_readings:  # nothing can be aligned with less

@@ -216,6 +216,52 @@ def evaluate_alignment(statistics: Any, thresholds: Any) -> int:
 
 evaluate_on_device = wp.func(evaluate_alignment)
 
+_DEMANDS: dict[int, tuple[tuple[str, str, bool], ...]] = {
+    TrackingStatus.FEW_POINTS: (("matches", "points", True),),
+    TrackingStatus.LITTLE_OVERLAP: (("overlap", "overlap", True),),
+    TrackingStatus.UNCONSTRAINED: (
+        ("sigma_m", "sigma", False),
+        ("degenerate_directions", "open directions", False),
+        ("relief_m", "relief", True),
+    ),
+    TrackingStatus.GEOMETRIC_MISMATCH: (
+        ("inlier_ratio", "inliers", True),
+        ("depth_conflict_ratio", "depth conflicts", False),
+    ),
+    TrackingStatus.PHOTOMETRIC_MISMATCH: (
+        ("photometric_inlier_ratio", "similar grey values", True),
+        ("correlation", "correlation", True),
+        ("cost", "cost", False),
+    ),
+    TrackingStatus.IMPLAUSIBLE_MOTION: (
+        ("motion_m", "motion in metres", False),
+        ("rotation_cos", "cosine of the rotation", True),
+    ),
+}
+"""Each status to the statistics that it may be due to: field, words, whether least is demanded."""
+
+
+def failed_demand(statistics: Any, thresholds: Any, status: int) -> str:
+    """The figure behind a refusal and what was demanded, as in "cost 1.61, at most 1.42".
+
+    Args:
+        statistics: ``AlignmentStatistics``, or a record with its fields.
+        thresholds: ``AcceptanceThresholds``, or a record with its fields.
+        status: the ``TrackingStatus`` of the alignment.
+
+    Returns:
+        The first figure that fails; empty if none does, as where something else refused the frame.
+    """
+    for name, words, is_least in _DEMANDS.get(status, ()):
+        found, demanded = _field(statistics, name), _field(thresholds, name)
+        if found < demanded if is_least else found > demanded:
+            return f"{words} {found:.3g}, at {'least' if is_least else 'most'} {demanded:.3g}"
+    return ""
+
+
+def _field(values: Any, name: str) -> float:
+    return float(values[name] if isinstance(values, np.void) else getattr(values, name))
+
 
 def is_photometrically_consistent(found: AlignmentStatistics) -> bool:
     """Whether a frame and the map's view show the same surface."""

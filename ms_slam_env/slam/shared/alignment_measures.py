@@ -17,6 +17,7 @@ from ms_slam_env.slam.shared.alignment_check import (
     AcceptanceThresholds,
     AlignmentStatistics,
     evaluate_alignment,
+    failed_demand,
 )
 
 _PHOTOMETRIC_LEVELS = 20.0  # largest difference of grey values after subtracting the median
@@ -143,10 +144,11 @@ def check_alignment(
     intrinsics: Intrinsics,
     thresholds: AcceptanceThresholds,
     samples: int = 5000,
-) -> tuple[AlignmentStatistics, str]:
-    """Measure an alignment, and say why it is not accepted; empty if it is."""
+) -> tuple[AlignmentStatistics, str, str]:
+    """Measure an alignment, and say why it is not accepted, and by which figure; empty if it is."""
     found = measure_alignment(frame, reference, T_reference_frame, intrinsics, samples)
-    return found, VIEW_REASONS[evaluate_alignment(found, thresholds)]
+    status = evaluate_alignment(found, thresholds)
+    return found, VIEW_REASONS[status], failed_demand(found, thresholds, status)
 
 
 def _back_project(

@@ -83,6 +83,7 @@ class Attempt(Generic[Match]):
     statistics: AlignmentStatistics  # statistics of its alignment
     reason: str  # why it is not accepted; empty if it is
     match: Match  # the backend's additional result
+    refusal: str = ""  # the figure behind the reason, and what was demanded
 
 
 class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
@@ -130,13 +131,13 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         if not self._has_map:
             reason = self._why_no_start(prepared)
             return self._lose(reason, NO_ALIGNMENT) if reason else self._take(frame, prepared)
-        reason, statistics = self._no_attempt, NO_ALIGNMENT
+        reason, statistics, refusal = self._no_attempt, NO_ALIGNMENT, ""
         for attempt in self._attempts(prepared, guess):
             if not attempt.reason:
                 return self._accept(frame, prepared, attempt)
-            reason, statistics = attempt.reason, attempt.statistics
+            reason, statistics, refusal = attempt.reason, attempt.statistics, attempt.refusal
         self._miss(frame, prepared)
-        return self._lose(reason, statistics)
+        return self._lose(reason, statistics, refusal)
 
     def mark_lost(self) -> None:
         """Treat tracking as lost; see ``SlamBackend``."""
@@ -166,12 +167,18 @@ class FrameByFrameSlam(Saved, SlamBackend, Generic[Frame, Match]):
         figures = found.inlier_ratio, found.residual_m
         return TrackResult(self._pose.copy(), True, relocalised, *figures, overlap=found.overlap)
 
-    def _lose(self, reason: str, statistics: AlignmentStatistics) -> TrackResult:
+    def _lose(self, reason: str, statistics: AlignmentStatistics, refusal: str = "") -> TrackResult:
         """Keep the pose and the map while tracking is lost."""
         self.mark_lost()
         figures = statistics.inlier_ratio, statistics.residual_m
         return TrackResult(
-            self._pose.copy(), False, False, *figures, reason, overlap=statistics.overlap
+            self._pose.copy(),
+            False,
+            False,
+            *figures,
+            reason,
+            overlap=statistics.overlap,
+            refusal=refusal,
         )
 
     @property

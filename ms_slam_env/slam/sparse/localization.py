@@ -147,7 +147,7 @@ class Localizer:
     def verify(self, fix: Fix, frame: LiveFrame) -> Attempt[Fix]:
         """Verify a pose by its matches, and by depth and intensity of its reference keyframe."""
         explained = len(fix.point_ids)
-        reason, found = "", NO_ALIGNMENT
+        reason, refusal, found = "", "", NO_ALIGNMENT
         if explained < LEAST_MATCHES:
             reason = f"only {explained} corners match the map, of {LEAST_MATCHES} needed"
         elif explained < _LEAST_EXPLAINED * fix.matches:
@@ -156,8 +156,8 @@ class Localizer:
             keyframe = self._map.keyframes[fix.reference]
             motion = invert(keyframe.T_world_camera) @ fix.T_world_camera
             images, rule = (frame.image, keyframe.image()), (self._thresholds, _SAMPLES)
-            found, reason = check_alignment(*images, motion, self._intrinsics, *rule)
-        return Attempt(fix.T_world_camera, found, reason, fix)
+            found, reason, refusal = check_alignment(*images, motion, self._intrinsics, *rule)
+        return Attempt(fix.T_world_camera, found, reason, fix, refusal)
 
     def _sightings(self, features: Features, which: Int64) -> Sightings:
         """Measurements of the selected features."""

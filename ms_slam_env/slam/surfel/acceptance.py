@@ -286,6 +286,7 @@ class Alignment:
     # (B, 6, 6) of the twist (rho, phi), metres and radians, with the true pose T_world_live
     # exp(twist).
     covariance: Float64
+    thresholds: NDArray[Any]  # (B,) what was demanded, ``AcceptanceThresholds`` each
 
     @property
     def tracked(self) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Bool, Float64, Int32
-from ms_slam_env.slam.shared.alignment_check import MAP_REASONS, TrackingStatus
+from ms_slam_env.slam.shared.alignment_check import MAP_REASONS, TrackingStatus, failed_demand
 from ms_slam_env.slam.slam_backend import Loop, TrackResult
 from ms_slam_env.slam.surfel.acceptance import Alignment
 
@@ -33,6 +33,7 @@ class TrackedBatch:
         overlap: (B,) share of the readings that land on the view.
         degenerate_directions: (B,) int32, of the pose's six, that the view does not constrain.
         covariance: (B, 6, 6) of the poses; NaN for a first frame and one that was not tracked.
+        alignment: what was found for the frames and demanded of it.
         loop_closed: (B,) whether the map was deformed, so that the pose jumped.
         loops: the loops that were found, by env.
     """
@@ -48,6 +49,7 @@ class TrackedBatch:
     overlap: Float64
     degenerate_directions: Int32
     covariance: Float64
+    alignment: Alignment
     loop_closed: Bool
     loops: dict[int, Loop] = field(default_factory=dict)
 
@@ -77,7 +79,12 @@ class TrackedBatch:
             loop_closed=bool(self.loop_closed[env]),
             loop=self.loops.get(env),
             moving=None if found_nothing else mask(env),
+            refusal="" if is_ok or is_first else self._refusal(env),
         )
+
+    def _refusal(self, env: int) -> str:
+        found, status = self.alignment, int(self.status[env])
+        return failed_demand(found.statistics[env], found.thresholds[env], status)
 
 
 def tracked_batch(
@@ -107,5 +114,6 @@ def tracked_batch(
         overlap=np.where(started, found["overlap"], as_first),
         degenerate_directions=np.where(started, found["degenerate_directions"], 0).astype(np.int32),
         covariance=covariance,
+        alignment=alignment,
         loop_closed=np.zeros(len(started), dtype=bool),
     )

@@ -321,7 +321,7 @@ class Tracker:
             state.photometry.write(photometry[:, None])
         self._search()
         self._refine(len(self._model_level) - 1, self.config.iterations)
-        return self._evaluate()
+        return self._evaluate(thresholds)
 
     def refine(
         self,
@@ -338,7 +338,7 @@ class Tracker:
         self._one.photometry.write(photometry[:, None])
         self._one.states.write(np.full((self.batch, 1), RUNNING, dtype=np.int32))
         self._refine(0, (FINE_ITERATIONS,))
-        return self._evaluate()
+        return self._evaluate(thresholds)
 
     def _set_model(
         self, model: ModelView, T_world_model: Float64, thresholds: NDArray[np.void]
@@ -404,7 +404,7 @@ class Tracker:
         step = min(iterations[0], 1)
         self.gauss_newton.iterate(0, self._stride(0), self._one, step, ends_with_sums=step == 0)
 
-    def _evaluate(self) -> Alignment:
+    def _evaluate(self, thresholds: NDArray[np.void]) -> Alignment:
         one, given = self._one, (self._predicted, self._thresholds, self._T_world_model)
         found = (self._T_world_live, self._status, self._statistics, self._covariance)
         arrays = [buffer.array for buffer in (*given, *found)]
@@ -418,4 +418,5 @@ class Tracker:
             statistics=self._statistics.read(),
             photometry=self._one.photometry.read()[:, 0],
             covariance=self._covariance.read(),
+            thresholds=thresholds.copy(),
         )

@@ -185,8 +185,8 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
         if T_model_camera is None:
             return Attempt(pose, NO_ALIGNMENT, "no motion aligns the frame with the model", None)
         motion = T_model_camera, self.intrinsics
-        found, reason = check_alignment(image, reference, *motion, thresholds)
-        return Attempt(pose @ T_model_camera, found, reason, None)
+        found, *refused = check_alignment(image, reference, *motion, thresholds)
+        return Attempt(pose @ T_model_camera, found, refused[0], None, refused[1])
 
     def _cast(self, pose: Float64) -> CastView:
         """The view that frames are aligned with, cast from ``pose``."""
