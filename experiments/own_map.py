@@ -17,7 +17,7 @@ from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.config import Checked, bounded, parse_named
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table, summary
+from ms_slam_env.report.tables import Table, Value, finished, make_table, summary
 
 COLUMNS = ("sequence", "image_size", "attempts_count", "found", "wrong", "frames_to_pose")
 
@@ -104,7 +104,7 @@ class OwnMap(Experiment, Checked):
             cells[spec["sequence"], spec["image_size"]] = row["result"]["attempts"]
         if len(cells) > 1:
             cells["all", "all"] = [one for attempts in cells.values() for one in attempts]
-        lines = [
+        lines: list[dict[str, Value]] = [
             {
                 **dict(zip(COLUMNS, cell, strict=False)),
                 "attempts_count": len(attempts),

@@ -359,7 +359,8 @@ def is_nearly_accepted(
 
 def doubt(frames: NDArray[np.int32]) -> Float64:
     """What is added to the covariances (B, 6, 6) of poses uncertain for ``frames`` (B,)."""
-    return frames[:, None, None] * np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
+    once = np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
+    return np.asarray(frames[:, None, None] * once, dtype=np.float64)
 
 
 def accept_any_fit(alignment: Alignment) -> Alignment:
