@@ -70,7 +70,7 @@ def motion_twists(
         raise InputError(f"covariances must be ({len(poses)}, 6, 6), got {C.shape}")
     motions = invert(poses[first]) @ poses[second]
     true_motions = invert(true_poses[first]) @ true_poses[second]
-    carry = np.array([adjoint(T) for T in invert(motions)]).reshape(-1, 6, 6)
+    carry = adjoint(invert(motions))
     summed = C[second] + carry @ C[first] @ np.swapaxes(carry, 1, 2)
     return pose_twists(motions, true_motions), summed
 

@@ -24,7 +24,7 @@ from ms_slam_env.slam.shared.alignment_check import MAP_REASONS, TrackingStatus
 from ms_slam_env.slam.shared.ferns import Candidate
 from ms_slam_env.slam.shared.state import Saved, check_has
 from ms_slam_env.slam.slam_backend import TrackResult
-from ms_slam_env.slam.surfel.acceptance import Alignment, with_doubt
+from ms_slam_env.slam.surfel.acceptance import Alignment, covariance_at_noise, with_doubt
 from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask
 from ms_slam_env.slam.surfel.keyframe_search import Images, make_relocalization
@@ -128,7 +128,9 @@ class BatchedSurfelSlam(Saved):
         self._shutter.take_time(times_s)
         if self._shutter.is_rolling:
             live, frames, alignment = self._unroll(taken, alignment)
-        results = [self._follow(env, live, alignment) for env in range(self.batch)]
+        alignment = covariance_at_noise(alignment, self._states.usual)
+        drift = self._states.follow_drift(alignment, self.intrinsics.fx)
+        results = [self._follow(env, live, alignment, drift[env]) for env in range(self.batch)]
         self._correct_exposure(live, self._states.photometry)
         known = np.array([result.tracking_ok for result in results])
         self._last_frames.keep(
@@ -193,10 +195,12 @@ class BatchedSurfelSlam(Saved):
             self._states.count(-1)
             self._fuse(live, frames, where)
 
-    def _follow(self, env: int, live: LiveFrame, alignment: Alignment) -> TrackResult:
+    def _follow(
+        self, env: int, live: LiveFrame, alignment: Alignment, drift: Float64
+    ) -> TrackResult:
         """Pose of a live frame: given for the first, tracked or searched for the others."""
         started = self._states.started[env]
-        return self._move_on(env, alignment) if started else self._start(env, live)
+        return self._move_on(env, alignment, drift) if started else self._start(env, live)
 
     def _start(self, env: int, live: LiveFrame) -> TrackResult:
         """Take the first frame at the given pose, if there is something in it to map."""
@@ -207,7 +211,7 @@ class BatchedSurfelSlam(Saved):
         self._states.start(env)
         return TrackResult(pose, True, moving=self.motion_mask.mask(env))
 
-    def _move_on(self, env: int, alignment: Alignment) -> TrackResult:
+    def _move_on(self, env: int, alignment: Alignment, drift: Float64) -> TrackResult:
         """Take the pose of a frame that was tracked, else hold the last one."""
         status, states = TrackingStatus(alignment.status[env]), self._states
         uncertain = status == TrackingStatus.UNCERTAIN
@@ -229,6 +233,7 @@ class BatchedSurfelSlam(Saved):
             reason=MAP_REASONS[status],
             degenerate_directions=int(alignment.statistics[env]["degenerate_directions"]),
             covariance=covariance if tracked else None,
+            drift=drift if tracked else None,
             uncertain=uncertain,
             overlap=float(alignment.statistics[env]["overlap"]),
             moving=self.motion_mask.mask(env),
@@ -292,10 +297,12 @@ class BatchedSurfelSlam(Saved):
     def restart(self, T_world_camera: Float64, env: int = 0) -> None:
         """Forget an env's map and its last frame, which is to be taken first of a new one.
 
-        What the recording's noise is stays known.
+        What the recording's noise is stays known, and how far the map has drifted.
         """
         frame, noise = self.last_frame(env), self.noise(env)
+        T_old_new, drift = invert(self.poses[env]) @ T_world_camera, self._states.drift[env].copy()
         self.reset(T_world_camera, env)
+        self._states.expect_drift(env, T_old_new, drift)
         self._states.set_time(env, frame)
         self.expect_noise(noise, env)
 
