@@ -397,17 +397,21 @@ def follow_drift(
         Drift (B, 6, 6) as twists of the cameras now, and the same for the frames that follow.
     """
     here, after = drift.copy(), drift.copy()
-    if moved.any():
-        carry = adjoint(invert(alignment.T_model_live[moved]))
-        found, added = drift[moved], alignment.covariance[moved]
-        is_first = ~found.any(axis=(1, 2))
-        found = carry @ found @ np.swapaxes(carry, 1, 2)
+    if not moved.any():
+        return here, after
+    whose: slice | NDArray[np.bool_] = slice(None) if moved.all() else moved
+    added = alignment.covariance[whose]
+    carry = adjoint(invert(alignment.T_model_live[whose]))
+    found = drift[whose]
+    is_first = found[:, 0, 0] == 0
+    found = carry @ found @ carry.swapaxes(1, 2)
+    if is_first.any():
         found[is_first] = added[is_first]
-        new = (1.0 - alignment.statistics["overlap"][moved]) * (REPLACED_PX / focal_px) ** 2
-        # What is doubted is not mapped.
-        share = np.where(is_first | alignment.uncertain[moved], 0.0, np.minimum(new, 1.0))
-        here[moved] = found
-        after[moved] = found + share[:, None, None] * added
+    new = (1.0 - alignment.statistics["overlap"][whose]) * (REPLACED_PX / focal_px) ** 2
+    # What is doubted is not mapped.
+    share = np.minimum(new, 1.0) * ~(is_first | alignment.uncertain[whose])
+    here[whose] = found
+    after[whose] = found + share[:, None, None] * added
     return here, after
 
 
