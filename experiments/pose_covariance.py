@@ -13,19 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ms_slam_env import scenes, sequences, slam
+from ms_slam_env import metrics, scenes, sequences, slam
 from ms_slam_env import sensor as sensors
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.geometry import invert, se3_log
+from ms_slam_env.metrics.consistency import COVERAGES
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, format_number, make_table
 
-DEGREES_OF_FREEDOM = 6
-BOUNDS = {"within_50": 0.5, "within_90": 0.9, "within_95": 0.95}
 WARM_UP = 5  # frames before the first error, so that there is a map
 COUNTS = ("frames", "degenerate_frames", "lost_frames")
 SIZES = ("alignment_error_m", "predicted_error_m", "alignment_error_rad", "predicted_error_rad")
@@ -108,12 +107,12 @@ class PoseCovariance(Experiment, Checked):
             "Shares of the errors within the ellipsoids that promise 50, 90 and 95 %. Factor of "
             f"the covariances that the validation seeds ask for: {format_number(factor)}."
         )
-        return [make_table(("sequence", *COUNTS, *BOUNDS, *SIZES), lines, note=note)]
+        return [make_table(("sequence", *COUNTS, *COVERAGES, *SIZES), lines, note=note)]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
         """Share of errors found in an ellipsoid over the share that it promises."""
         promised = np.linspace(0.01, 0.99, 99)
-        limits = chi2_limits(promised)
+        limits = metrics.nees_limits(promised)
         series = [Series("right", [0.0, 1.0], [0.0, 1.0], mode="lines")]
         for seeds, results in _by_split(rows).items():
             squared = squared_errors(results)
@@ -127,8 +126,8 @@ class PoseCovariance(Experiment, Checked):
         """The factor from the validation seeds, and the coverage on test seeds with it."""
         results = _by_split(rows)
         factor = scale(squared_errors(results[VALIDATION]))
-        met = coverage(squared_errors(results[TEST]), factor)
-        return {"validation_factor": factor, "test_coverage_with_factor": met}
+        met = metrics.covariance_coverage(squared_errors(results[TEST]), factor)
+        return {"validation_factor": factor, "test_coverage_with_factor": [*met.values()]}
 
 
 def measure(
@@ -160,37 +159,16 @@ def measure(
         "frames": len(xi),
         "degenerate_frames": degenerate,
         "lost_frames": lost,
-        "squared_errors": squared(xi, C).tolist(),
+        "squared_errors": metrics.nees(xi, C).tolist(),
         **dict(zip(SIZES, map(_rms, sizes), strict=True)),
     }
-
-
-def squared(twists: Float64, covariances: Float64) -> Float64:
-    """xi^T C^-1 xi (N,) of twists (N, 6) with covariances (N, 6, 6)."""
-    if not len(twists):
-        return np.zeros(0)
-    solved = np.linalg.solve(covariances, twists[..., None])[..., 0]
-    return np.asarray((twists * solved).sum(axis=1))
-
-
-def chi2_limits(shares: ArrayLike) -> Float64:
-    """Limits below which these shares of the squared errors lie if the covariances are right."""
-    from scipy.stats import chi2
-
-    return np.asarray(chi2.ppf(shares, DEGREES_OF_FREEDOM))
-
-
-def coverage(squared: Float64, factor: float = 1.0) -> list[float]:
-    """Share of errors within the ellipsoids of ``BOUNDS``, with covariances times ``factor``."""
-    limits = factor * chi2_limits(list(BOUNDS.values()))
-    return [float((squared < limit).mean()) if len(squared) else np.nan for limit in limits]
 
 
 def scale(squared: Float64) -> float:
     """Factor of the covariances for which 90 % of the errors lie within the 90 % bound."""
     if not len(squared):
         return float("nan")
-    return float(np.quantile(squared, 0.9) / chi2_limits(0.9))
+    return float(np.quantile(squared, 0.9) / metrics.nees_limits(0.9))
 
 
 def squared_errors(results: Iterable[Mapping[str, Any]]) -> Float64:
@@ -203,7 +181,7 @@ def pooled(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     known = [result for result in results if result["frames"]]
     frames = [result["frames"] for result in known]
     line: dict[str, Any] = {key: sum(result[key] for result in results) for key in COUNTS}
-    line |= dict(zip(BOUNDS, coverage(squared_errors(results)), strict=True))
+    line |= metrics.covariance_coverage(squared_errors(results))
     for key in SIZES:
         squares = [result[key] ** 2 for result in known]
         line[key] = float(np.sqrt(np.average(squares, weights=frames))) if known else None

@@ -93,8 +93,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
 
     ## Info
     ``T_world_camera``, ``T_world_camera_estimate`` (4, 4); ``pose_covariance`` (6, 6) of the
-    estimate, for the twist (rho, phi) in metres and radians in the camera frame, infinite where
-    SLAM gave none (at the start, while lost, or from a backend or pose source without one);
+    estimate relative to the map, without the map's drift, for the twist (rho, phi) in metres and
+    radians in the camera frame, infinite where SLAM gave none (at the start, while lost, or from
+    a backend or pose source without one);
     ``pose_error`` m; ``ate`` running RMSE of the pose error over all frames, m, no alignment;
     ``divergence`` (2,) intensity and depth between the last frames of this step and the one
     before, nats; ``tracking_ok``; ``submap``, 0 for the first and those joined to it: in

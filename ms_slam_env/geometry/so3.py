@@ -15,9 +15,13 @@ _SMALL_ANGLE = 1e-5  # below this the closed forms lose digits to cancellation; 
 
 
 def hat(phi: ArrayLike) -> Float64:
-    """Return the (3, 3) skew matrix with ``hat(phi) @ v == cross(phi, v)``."""
-    x, y, z = np.asarray(phi, dtype=np.float64)
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    """Skew matrices (..., 3, 3) with ``hat(phi) @ v == cross(phi, v)``, of ``phi`` (..., 3)."""
+    vector = np.asarray(phi, dtype=np.float64)
+    skew = np.zeros((*vector.shape, 3))
+    for row, column, axis in ((2, 1, 0), (0, 2, 1), (1, 0, 2)):
+        skew[..., row, column] = vector[..., axis]
+        skew[..., column, row] = -vector[..., axis]
+    return skew
 
 
 def so3_exp(phi: ArrayLike) -> Float64:
@@ -63,7 +67,13 @@ def se3_log(T: ArrayLike) -> Float64:
 
 
 def adjoint(T: ArrayLike) -> Float64:
-    """Matrix (6, 6) that maps twists from frame b to frame a; ``T`` is T_a_b; equation (175)."""
+    """Matrices (..., 6, 6) that map twists from frame b to frame a; equation (175).
+
+    ``T`` (..., 4, 4) is T_a_b.
+    """
     matrix = np.asarray(T, dtype=np.float64)
-    R = matrix[:3, :3]
-    return np.block([[R, hat(matrix[:3, 3]) @ R], [np.zeros((3, 3)), R]])
+    R = matrix[..., :3, :3]
+    mapping = np.zeros((*matrix.shape[:-2], 6, 6))
+    mapping[..., :3, :3] = mapping[..., 3:, 3:] = R
+    mapping[..., :3, 3:] = hat(matrix[..., :3, 3]) @ R
+    return mapping

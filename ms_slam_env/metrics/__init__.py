@@ -7,6 +7,14 @@ from ms_slam_env._runtime.lazy import lazy_names
 if TYPE_CHECKING:
     from ms_slam_env.geometry.cloud_registration import CloudRegistration, register_clouds
     from ms_slam_env.geometry.point_clouds import umeyama, voxel_downsample
+    from ms_slam_env.metrics.consistency import (
+        covariance_coverage,
+        motion_twists,
+        nees,
+        nees_limits,
+        pose_twists,
+        silently_wrong,
+    )
     from ms_slam_env.metrics.cost import (
         CORE_WATTS,
         CostMeter,
@@ -93,6 +101,7 @@ __all__ = [
     "ate_statistics",
     "cloud_distance",
     "completion",
+    "covariance_coverage",
     "drifts",
     "energy_counters",
     "equal_pieces",
@@ -106,11 +115,15 @@ __all__ = [
     "local_scales",
     "mean_path_length",
     "mean_relocalisation_time",
+    "motion_twists",
     "nearest_distances",
+    "nees",
+    "nees_limits",
     "noise_ratio",
     "path_length",
     "point_spacing",
     "pose_pairs",
+    "pose_twists",
     "precision",
     "rcm",
     "recall",
@@ -121,6 +134,7 @@ __all__ = [
     "rer",
     "rpe_rmse",
     "rpe_statistics",
+    "silently_wrong",
     "statistical_inliers",
     "statistics_of",
     "task_time",

@@ -63,10 +63,16 @@ class TrackResult:
             if there was none.
         degenerate_directions: how many of the pose's six degrees of freedom the view does not
             constrain, as in front of a blank wall; along them the pose is only predicted.
-        covariance: (6, 6) covariance of the pose relative to the map, excluding the map's own
-            drift. It is that of the twist xi = (rho, phi) in metres and radians, in the camera's
-            frame, with the true pose T_world_camera exp(xi). None if no pose was estimated or the
-            backend does not compute it.
+        covariance: (6, 6) covariance of the pose relative to the map, the error of one alignment;
+            it excludes the map's own drift and does not grow along the way. It is that of the twist
+            xi = (rho, phi) in metres and radians, in the camera's frame, with the true pose
+            T_world_camera exp(xi). None if no pose was estimated or the backend does not compute
+            it. The motion between two frames in view of the same surface has about the sum of
+            their covariances, the earlier carried along (``metrics.motion_twists``).
+        drift: (6, 6) covariance, of the same twist, of where the map about the camera lies in the
+            world of the first pose. ``covariance + drift`` is that of T_world_camera itself. It
+            does not shrink where the camera comes back or a loop is closed. None where
+            ``covariance`` is None or the backend does not compute it.
         submap: number of the frame's submap, that is of the oldest submap it is joined to. The pose
             in a submap not joined to the first is only as good as the guess it started from, and
             ``covariance`` includes that error.
@@ -106,6 +112,7 @@ class TrackResult:
     submaps_joined: bool = False
     moving: NDArray[np.bool_] | None = None
     refusal: str = ""
+    drift: Float64 | None = None
 
 
 @dataclass(frozen=True)

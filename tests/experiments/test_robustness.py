@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ms_slam_experiments.robustness import (
     VARIATIONS,
     Robustness,
     RobustnessSpec,
+    consistency,
     judged,
     part_of,
 )
 
 from ms_slam_env.errors import InputError
+from ms_slam_env.geometry import make_pose, se3_exp
 from ms_slam_env.sequences import open_sequence
+from ms_slam_env.slam.slam_backend import TrackResult
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +76,15 @@ def test_success_is_few_losses_and_an_error_near_the_best_median() -> None:
     assert part_of("usme:city-traffic:2000") == part_of("../hololens") == "judging"
 
 
+def test_an_error_below_a_centimetre_is_none_however_good_the_best_run_is() -> None:
+    rows = [row("a:1000", "320x240", 0.001)]
+    rows += [row("a:1000", "80x60", ate) for ate in (0.002, 0.0021, 0.01, 0.0101)]
+    rows += [row("a:1000", "80x60", 0.001, lost=0.06)]
+    lines = judged(rows)
+    assert [line["near_best"] for line in lines] == [True, True, False, False, False, False]
+    assert [line["succeeded"] for line in lines] == [True, True, True, True, False, False]
+
+
 def test_what_is_run_by_default_exists() -> None:
     made = Robustness(image_sizes=("80x60",), variations=("none",))
     specs = made.specs()
@@ -85,3 +99,58 @@ def test_a_recording_is_named_with_its_folder() -> None:
     assert (first.sequence, first.source, first.layout) == ("h", "some/where", "folder")
     with pytest.raises(InputError, match="NAME=FOLDER"):
         Robustness(recordings=("some/where",))
+
+
+def _results(drift: float, doubted: int = 0) -> tuple[list[TrackResult], np.ndarray]:
+    """A camera at rest, errors of 1 mm and mrad along each axis, and a map 2 cm off its place."""
+    rng = np.random.default_rng(3)
+    truth = np.tile(np.eye(4), (600, 1, 1))
+    offset = make_pose(np.eye(3), [0.02, 0.0, 0.0])
+    C, D = 1e-6 * np.eye(6), drift**2 * np.eye(6)
+    results = [TrackResult(np.eye(4), True), TrackResult(np.eye(4), False)]
+    for k in range(len(truth) - 2):
+        pose = offset @ se3_exp(rng.normal(0, 1e-3, 6))
+        results.append(TrackResult(pose, True, covariance=C, drift=D, uncertain=k < doubted))
+    return results, truth
+
+
+def test_covariances_are_judged_with_and_without_the_drift_of_the_map() -> None:
+    found = consistency(*_results(drift=0.0))
+    assert found["motion_nees"] == pytest.approx(1, rel=0.1)
+    assert found["motion_within_90"] == pytest.approx(0.9, abs=0.03)
+    assert found["pose_nees"] > 10
+    assert found["pose_within_95"] == 0
+    assert found["silent_share"] == 1
+    told = consistency(*_results(drift=0.02))
+    assert told["silent_share"] == 0
+    assert told["pose_within_95"] == 1
+    assert told["motion_nees"] == found["motion_nees"]
+    assert consistency(*_results(drift=0.0, doubted=299))["silent_share"] == 0.5
+    assert consistency([TrackResult(np.eye(4), True)], np.eye(4)[None]) == {}
+
+
+def test_a_jump_is_no_motion_of_the_camera() -> None:
+    results, truth = _results(drift=0.0)
+    a_metre = make_pose(np.eye(3), [1.0, 0.0, 0.0])
+    jumped = replace(results[300], T_world_camera=a_metre, loop_closed=True)
+    back = replace(results[301], submap=1)
+    after = consistency([*results[:300], jumped, back, *results[302:]], truth)
+    assert after["motion_nees"] < 1.2
+    as_motion = consistency(
+        [*results[:300], replace(jumped, loop_closed=False), *results[301:]], truth
+    )
+    assert as_motion["motion_nees"] > 100
+
+
+def test_covariances_have_tables_where_a_backend_gives_them() -> None:
+    line = row("a:1000", "80x60", 0.01)
+    line["spec"] |= {"variation": "none"}
+    line["result"] |= {"cpu_ms_median": 1.0}
+    tables = Robustness().tables([line])
+    assert not any("Covariance" in table.title for table in tables)
+    line["result"] |= consistency(*_results(drift=0.0))
+    table = next(t for t in Robustness().tables([line]) if t.title == "Covariance by sequence")
+    (shown,) = table.rows
+    assert shown["sequence"] == "a:1000"
+    assert shown["pose_within_95"].value == 0
+    assert shown["silent_share_worst"] == 1

@@ -217,6 +217,7 @@ class SelectiveSlam(Saved, BorrowedMap):
             T_world_camera=pose,
             relocalised=False,
             covariance=None,
+            drift=None,
             loop_closed=False,
             submaps_joined=False,
             processed=False,
@@ -301,7 +302,7 @@ class SelectiveSlam(Saved, BorrowedMap):
     def state_like(self) -> Any:
         """See ``Stateful``; "frames" are those that the backend has counted."""
         result = _copied(vars(TrackResult(np.eye(4), True)))
-        result |= {"covariance": OrNone(np.zeros((6, 6)))}
+        result |= dict.fromkeys(("covariance", "drift"), OrNone(np.zeros((6, 6))))
         result |= {"moving": OrNone(ArrayOf(np.bool_, ("rows", "columns")))}
         like = {
             "last": OrNone(result),

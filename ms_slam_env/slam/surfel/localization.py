@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
-from ms_slam_env.geometry import invert, se3_log
+from ms_slam_env.geometry import adjoint, invert, se3_log
 from ms_slam_env.slam.shared.alignment_check import (
     DISPUTED,
     AlignmentStatistics,
@@ -33,6 +33,7 @@ from ms_slam_env.slam.surfel.acceptance import (
     acceptance_thresholds,
     at_usual_noise,
     fit_of_noise,
+    follow_drift,
     follow_usual,
     geometric_thresholds,
     is_nearly_accepted,
@@ -78,6 +79,8 @@ class CameraStates(Stateful):
         doubted: (B,) frames in a row whose pose is uncertain.
         usual: (B,) cost and shares of inliers of the alignments that were accepted of late,
             ``acceptance.USUAL`` each.
+        drift: (B, 6, 6) covariances of where the maps about the cameras lie in the world, as
+            twists of the cameras.
     """
 
     poses: Float64
@@ -88,6 +91,7 @@ class CameraStates(Stateful):
     time: NDArray[np.int32]
     doubted: NDArray[np.int32]
     usual: NDArray[Any]
+    drift: Float64
 
     def __init__(self, batch: int) -> None:
         """Cameras at the identity pose that have seen nothing."""
@@ -95,7 +99,7 @@ class CameraStates(Stateful):
         own: dict[str, NDArray[Any]] = {"poses": identity, "motions": identity.copy()}
         own |= {"photometry": same_exposure(batch), "started": np.zeros(batch, dtype=bool)}
         own |= {name: zeros.copy() for name in ("lost", "time", "doubted")}
-        own["usual"] = fit_of_noise(batch)
+        own["usual"], own["drift"] = fit_of_noise(batch), np.zeros((batch, 6, 6))
         self._own = own
         for name, array in own.items():
             shown = array.view()
@@ -137,6 +141,17 @@ class CameraStates(Stateful):
             least_scale,
         )
 
+    def follow_drift(self, alignment: Alignment, focal_px: float) -> Float64:
+        """Let the drift of the maps grow by what frames add; return it (B, 6, 6) without that."""
+        moved = self.started & (alignment.tracked | alignment.uncertain)
+        here, self._own["drift"][:] = follow_drift(self.drift, alignment, moved, focal_px)
+        return here
+
+    def expect_drift(self, env: int, T_old_new: Float64, drift: Float64) -> None:
+        """Give an env the ``drift`` (6, 6) that a camera had which has moved by ``T_old_new``."""
+        carry = adjoint(invert(T_old_new))
+        self._own["drift"][env] = carry @ drift @ carry.T
+
     def hold(self, where: NDArray[np.bool_]) -> None:
         """Leave the envs ``where`` (B,) as their frames were not tracked."""
         self._own["motions"][where] = np.eye(4)
@@ -146,6 +161,7 @@ class CameraStates(Stateful):
     def follow(self, poses: Float64, motions: Float64) -> None:
         """Take known poses (B, 4, 4) and the motions (B, 4, 4) that led there."""
         self._own["poses"][:], self._own["motions"][:], self._own["lost"][:] = poses, motions, 0
+        self._own["drift"][:] = 0
 
     def move_to(self, env: int, pose: Float64) -> None:
         """Put one env's camera at another pose (4, 4): its map has moved."""

@@ -24,7 +24,7 @@ from ms_slam_env.slam.shared.ferns import Candidate
 from ms_slam_env.slam.shared.images import Images, images_of
 from ms_slam_env.slam.shared.state import Saved, check_has
 from ms_slam_env.slam.slam_backend import TrackResult
-from ms_slam_env.slam.surfel.acceptance import Alignment, doubt
+from ms_slam_env.slam.surfel.acceptance import Alignment, covariance_at_noise, doubt
 from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.free_space_mask import make_motion_mask
 from ms_slam_env.slam.surfel.keyframe_search import make_relocalization
@@ -148,7 +148,10 @@ class BatchedSurfelSlam(Saved):
         self._shutter.take_time(times_s)
         if self._shutter.is_rolling:
             live, frames, alignment = self._unroll(taken, alignment)
-        found = self._follow(live, alignment)
+        alignment = covariance_at_noise(alignment, self._states.usual)
+        found = self._follow(
+            live, alignment, self._states.follow_drift(alignment, self.intrinsics.fx)
+        )
         self._correct_exposure(live, self._states.photometry)
         still = Images(frames.color, self.motion_mask.still(frames.depth))
         self._last_frames.keep(still, self.poses, found.tracking_ok)
@@ -209,7 +212,7 @@ class BatchedSurfelSlam(Saved):
             self._states.count(-1)
             self._fuse(live, frames, where)
 
-    def _follow(self, live: LiveFrame, alignment: Alignment) -> TrackedBatch:
+    def _follow(self, live: LiveFrame, alignment: Alignment, drift: Float64) -> TrackedBatch:
         """Poses of the live frames: given for the first, tracked or searched for the others.
 
         Where a frame was not tracked the last pose is held. A first frame is taken if there is
@@ -222,7 +225,8 @@ class BatchedSurfelSlam(Saved):
         tracked = started & (alignment.tracked | alignment.uncertain)
         states.accept(tracked, alignment, self.config.cauchy_rgb)
         states.hold(started & ~tracked)
-        return tracked_batch(alignment, started, begins, lost, states.poses, doubt(1 + doubted))
+        doubts = doubt(1 + doubted)
+        return tracked_batch(alignment, started, begins, lost, states.poses, doubts, drift)
 
     def _fuse(self, live: LiveFrame, frames: Images, good: NDArray[np.bool_]) -> None:
         """Fuse the frames with a good pose; a fast camera's readings weigh less."""
@@ -279,10 +283,12 @@ class BatchedSurfelSlam(Saved):
     def restart(self, T_world_camera: Float64, env: int = 0) -> None:
         """Forget an env's map and its last frame, which is to be taken first of a new one.
 
-        What the recording's noise is stays known.
+        What the recording's noise is stays known, and how far the map has drifted.
         """
         frame, noise = self.last_frame(env), self.noise(env)
+        T_old_new, drift = invert(self.poses[env]) @ T_world_camera, self._states.drift[env].copy()
         self.reset(T_world_camera, env)
+        self._states.expect_drift(env, T_old_new, drift)
         self._states.set_time(env, frame)
         self.expect_noise(noise, env)
 

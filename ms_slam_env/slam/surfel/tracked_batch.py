@@ -33,6 +33,8 @@ class TrackedBatch:
         overlap: (B,) share of the readings that land on the view.
         degenerate_directions: (B,) int32, of the pose's six, that the view does not constrain.
         covariance: (B, 6, 6) of the poses; NaN for a first frame and one that was not tracked.
+        drift: (B, 6, 6) of the maps about the cameras in the world; meaningless where
+            ``covariance`` is NaN.
         alignment: what was found for the frames and demanded of it.
         loop_closed: (B,) whether the map was deformed, so that the pose jumped.
         loops: the loops that were found, by env.
@@ -49,6 +51,7 @@ class TrackedBatch:
     overlap: Float64
     degenerate_directions: Int32
     covariance: Float64
+    drift: Float64
     alignment: Alignment
     loop_closed: Bool
     loops: dict[int, Loop] = field(default_factory=dict)
@@ -74,6 +77,7 @@ class TrackedBatch:
             reason=NO_START if found_nothing else MAP_REASONS[int(self.status[env])],
             degenerate_directions=int(self.degenerate_directions[env]),
             covariance=self.covariance[env].copy() if is_ok and not is_first else None,
+            drift=self.drift[env].copy() if is_ok and not is_first else None,
             uncertain=bool(self.uncertain[env]),
             overlap=float(self.overlap[env]),
             loop_closed=bool(self.loop_closed[env]),
@@ -88,7 +92,13 @@ class TrackedBatch:
 
 
 def tracked_batch(
-    alignment: Alignment, started: Bool, begins: Bool, lost: Bool, poses: Float64, doubt: Float64
+    alignment: Alignment,
+    started: Bool,
+    begins: Bool,
+    lost: Bool,
+    poses: Float64,
+    doubt: Float64,
+    drift: Float64,
 ) -> TrackedBatch:
     """Results of the frames of envs that had ``started`` (B,), or begin with them (B,).
 
@@ -114,6 +124,7 @@ def tracked_batch(
         overlap=np.where(started, found["overlap"], as_first),
         degenerate_directions=np.where(started, found["degenerate_directions"], 0).astype(np.int32),
         covariance=covariance,
+        drift=drift,
         alignment=alignment,
         loop_closed=np.zeros(len(started), dtype=bool),
     )
