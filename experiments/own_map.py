@@ -94,7 +94,8 @@ class OwnMap(Experiment, Checked):
             expected = mapping.estimates[shown]
             here = Interruption(0, expected, -1, 1.0)
             attempts.append({"frame": first, **interrupt(backend, here, frames, expected)})
-        return {"mapped_share": float(is_mapped.mean()), "attempts": attempts}
+        figures = {"frames": len(mapping), "lost_share": mapping.lost}
+        return {**figures, "mapped_share": float(is_mapped.mean()), "attempts": attempts}
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """One line for each sequence and image size, and all together."""

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from ms_slam_experiments.own_map import OwnMap
 
+from ms_slam_env.benchmark.rows import run_experiment
+
 SMALL = {"sequences": ("table:2000",), "image_sizes": ("80x60",), "frames": 40, "every": 12}
 
 
-def attempts(backend: str) -> list[dict]:
-    (spec,) = OwnMap(**SMALL, backends=(backend,)).specs()
-    return OwnMap.run(spec)["attempts"]
-
-
-def test_frames_are_found_in_their_own_map() -> None:
-    found = attempts("surfel")
+def test_frames_are_found_in_their_own_map(tmp_path) -> None:
+    (row,) = run_experiment(OwnMap(**SMALL), tmp_path / "own_map").results.rows
+    found = row["result"]["attempts"]
+    assert (row["result"]["frames"], row["result"]["lost_share"]) == (40, 0.0)
     assert [one["frame"] for one in found] == [0, 12, 24]
     assert all(one["found"] and not one["wrong"] for one in found)
     assert max(one["first_error_m"] for one in found) < 0.005
