@@ -405,7 +405,7 @@ def part_of(source: str) -> str:
 
 
 def _covariance(lines: Sequence[Mapping[str, Any]], by: Sequence[str], title: str) -> Table:
-    """Medians over runs of how well covariances explain errors, for lines with the same ``by``."""
+    """How well covariances explain errors, for lines with the same ``by``."""
     keys = [f"{name}_{key}" for name in ("motion", "pose") for key in ("nees", *COVERAGES)]
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for line in lines:
@@ -414,7 +414,8 @@ def _covariance(lines: Sequence[Mapping[str, Any]], by: Sequence[str], title: st
         {
             **dict(zip(by, group, strict=True)),
             "runs_counted": len(own),
-            **{key: summary(own, key) for key in (*keys, "silent_share")},
+            **{key: summary(own, key) for key in keys if key.endswith("nees")},
+            **{key: _mean(own, key) for key in (*keys, "silent_share") if "nees" not in key},
             "silent_share_worst": max(line["silent_share"] for line in own),
         }
         for group, own in groups.items()
@@ -422,10 +423,16 @@ def _covariance(lines: Sequence[Mapping[str, Any]], by: Sequence[str], title: st
     note = (
         "A right covariance has NEES of 1, and 50, 90 and 95 % within the ellipsoids that promise "
         "it. Motions are those from frame to frame, poses those in the world of the first, with "
-        "the drift of the map."
+        "the drift of the map. Medians of NEES over the runs, means of shares."
     )
     columns = (*by, "runs_counted", *keys, "silent_share", "silent_share_worst")
     return make_table(columns, made, title, note)
+
+
+def _mean(lines: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    """Mean of a value over the runs that have it."""
+    values = [line[key] for line in lines if line.get(key) is not None]
+    return float(np.mean(values)) if values else None
 
 
 _SUMMARIES = ("succeeded", "near_best", "ate_m", "lost_share")

@@ -152,5 +152,6 @@ def test_covariances_have_tables_where_a_backend_gives_them() -> None:
     table = next(t for t in Robustness().tables([line]) if t.title == "Covariance by sequence")
     (shown,) = table.rows
     assert shown["sequence"] == "a:1000"
-    assert shown["pose_within_95"].value == 0
+    assert shown["pose_nees"].value > 10
+    assert shown["pose_within_95"] == 0
     assert shown["silent_share_worst"] == 1

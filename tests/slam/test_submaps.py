@@ -107,6 +107,8 @@ def test_an_unjoined_submap_says_how_unsure_it_is_and_keeps_the_old_map(frames):
     assert results[-1].submap == 1
     sure, unsure = (np.trace(results[k].covariance[:3, :3]) for k in (JUMP - 1, -1))
     assert unsure > 100 * sure
+    drift = [np.trace(results[k].drift[:3, :3]) for k in (JUMP - 1, JUMP + 2, JUMP + 3)]
+    assert 0 < drift[0] < drift[1] < drift[2]  # the map before is as far off, seen from elsewhere
     points, attributes = backend.surface_points(), backend.map_attributes()
     labels = attributes["submap"]
     assert len(points) == len(labels) == len(attributes["normal"])

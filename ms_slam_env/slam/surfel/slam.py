@@ -321,6 +321,10 @@ class BatchedSurfelSlam(Saved):
         """Motion (4, 4) that is expected of an env's next frame."""
         return self._states.motions[env].copy()
 
+    def drift(self, env: int = 0) -> Float64:
+        """Covariance (6, 6) of where the map about an env's camera lies in the world."""
+        return self._states.drift[env].copy()
+
     def frames_lost(self, env: int = 0) -> int:
         """Frames since an env's tracking was lost; 0: it is not."""
         return int(self._states.lost[env])

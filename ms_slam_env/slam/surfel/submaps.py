@@ -334,9 +334,11 @@ class AtlasSubmaps(Saved):
         covariance = self._ledger.covariance(self._present, pose)
         if result.covariance is not None:
             covariance = covariance + result.covariance
-        return replace(
-            result, submap=self._present, covariance=covariance if result.tracking_ok else None
-        )
+        if not result.tracking_ok:
+            return replace(result, submap=self._present, covariance=None)
+        # The first frame of a submap is at a given pose, as far off as the map before it.
+        drift = self._slam.drift() if result.drift is None else result.drift
+        return replace(result, submap=self._present, covariance=covariance, drift=drift)
 
     # -- Losing a map --------------------------------------------------------------------------
 
