@@ -19,6 +19,7 @@ from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
+from ms_slam_env.slam.surfel.device import threads_per_row
 from ms_slam_env.slam.surfel.rendering import (
     ModelView,
     SplatParameters,
@@ -163,6 +164,7 @@ def resolve_views(
     motions: wp.array[wp.mat44],
     camera: SplatCamera,
     keys: wp.array[wp.int64],
+    columns: int,  # per thread
     intensity: wp.array[wp.float32],
     depth: wp.array[wp.float32],
     normals: wp.array[wp.vec3],
@@ -171,7 +173,7 @@ def resolve_views(
 
     The depth at a pixel is that of the winner's plane, within a tenth of the winner's own depth.
     """
-    view, v = wp.tid()
+    view, v, piece = wp.tid()
     e = view / views_per_env
     R = rotation_of(motions[view])
     t = translation_of(motions[view])
@@ -187,7 +189,7 @@ def resolve_views(
         -camera.centre[0] / camera.focal[0], (float(v) - camera.centre[1]) / camera.focal[1], 1.0
     )
     forward = wp.vec3(R[2, 0], R[2, 1], R[2, 2])
-    for u in range(width):
+    for u in range(piece * columns, wp.min((piece + 1) * columns, width)):
         key = keys[row + u]
         if key == EMPTY:
             key = gap_key(keys, image, v, u, height, width)
@@ -350,8 +352,9 @@ class ViewPredictor:
         dim, inputs = (total, self.workers), [*shared, self.workers, keys]
         wp.launch(scatter_points, dim, inputs, device=self.device)
         images = [image.flatten() for image in (views.intensity, views.depth, views.normals)]
-        dim, inputs = (total, views.intrinsics.height), [*shared, keys, *images]
-        wp.launch(resolve_views, dim, inputs, device=self.device)
+        columns, threads = threads_per_row(views.intrinsics.width, self.device)
+        dim = (total, views.intrinsics.height, threads)
+        wp.launch(resolve_views, dim, [*shared, keys, columns, *images], device=self.device)
 
     def _predict_singly(self, poses: Float64, views: DeviceViews, first_env: int) -> None:
         """Splat the surfels themselves into every view, one view per env at a time.
