@@ -258,30 +258,28 @@ def splat_attributes(
 
 
 @wp.kernel
-def list_hidden(
+def leave_hidden(
     visible: VisibleList,
     camera: SplatCamera,
     workers: int,
     z_buffer: wp.array[wp.float32],
-    hidden: VisibleList,
+    footprints: SplatFootprints,
 ) -> None:
-    """List the visible surfels well behind the front surface at their own pixel."""
+    """Leave only the surfels to draw that lie well behind the front surface at their own pixel."""
     k, worker = wp.tid()
     image = k * camera.height * camera.width
     for j in range(worker, visible.count[k], workers):
         p = visible.position[k, j]
         u = floor_int(camera.focal[0] * p[0] / p[2] + camera.centre[0] + 0.5)
         v = floor_int(camera.focal[1] * p[1] / p[2] + camera.centre[1] + 0.5)
+        is_hidden = bool(False)
         if u >= 0 and u < camera.width and v >= 0 and v < camera.height:
             inverse = z_buffer[image + v * camera.width + u]
             if inverse > 0.0:
                 front = 1.0 / inverse
-                if p[2] > front + 2.0 * depth_tolerance(camera.tolerance_m, front):
-                    slot = wp.atomic_add(hidden.count, k, 1)
-                    hidden.index[k, slot] = visible.index[k, j]
-                    hidden.position[k, slot] = p
-                    hidden.normal[k, slot] = visible.normal[k, j]
-                    hidden.radius[k, slot] = visible.radius[k, j]
+                is_hidden = p[2] > front + 2.0 * depth_tolerance(camera.tolerance_m, front)
+        if not is_hidden:
+            footprints.right[k, j] = -1  # before the first column
 
 
 @wp.func_native(native_source("splatting", "resolve_row"))
@@ -384,7 +382,7 @@ class SplatRenderer:
         self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=self.device)
         self._sums = wp.zeros(pixels, dtype=Sums, device=self.device)
         self._culler = FrustumCuller(buffers, envs, self.camera, window)
-        self._splats: dict[tuple[int, int], list[RecordedLaunch]] = {}
+        self._splats: dict[int, list[RecordedLaunch]] = {}
         images = [a.flatten() for a in (view.vertices, view.normals, view.intensity, view.color)]
         columns, threads = threads_per_row(intrinsics.width, self.device)
         dim, inputs = (
@@ -412,24 +410,33 @@ class SplatRenderer:
         """
         self._culler(poses, first_env, margin_px, layers)
 
-    def splat(self, first_env: int = 0, listed: VisibleList | None = None) -> ModelView:
-        """Draw the surfels that ``cull`` listed, or those of another list."""
-        listed = self.visible if listed is None else listed
+    def splat(self, first_env: int = 0) -> ModelView:
+        """Draw the surfels that ``cull`` listed."""
+        return self._draw(first_env, 0)
+
+    def splat_hidden(self, first_env: int = 0) -> ModelView:
+        """Draw those of them that lie well behind the surface that ``splat`` just drew."""
+        inputs = [self.visible, self.camera, self._buffers.workers, self._z_buffer]
+        dim = (self.envs, self._buffers.workers)
+        wp.launch(leave_hidden, dim, [*inputs, self._buffers.footprints], device=self.device)
+        return self._draw(first_env, 1)
+
+    def _draw(self, first_env: int, first_pass: int) -> ModelView:
+        """Make the passes over the listed surfels from one of them on."""
         self._z_buffer.zero_()
         self._sums.zero_()
         self._buffers.footprints.num_drawn.zero_()
-        key = (id(listed), first_env)
-        if key not in self._splats:
-            self._splats[key] = self._record_splats(listed, first_env)
-        for launch in (*self._splats[key], self._resolve):
+        if first_env not in self._splats:
+            self._splats[first_env] = self._record_splats(first_env)
+        for launch in (*self._splats[first_env][first_pass:], self._resolve):
             launch.launch()
         return self.view
 
-    def _record_splats(self, listed: VisibleList, first_env: int) -> list[RecordedLaunch]:
-        """The three passes over the surfels of a list."""
+    def _record_splats(self, first_env: int) -> list[RecordedLaunch]:
+        """The three passes over the listed surfels."""
         surfels, workers = self._buffers.surfels, self._buffers.workers
-        shared = [listed, self.camera, workers, self._buffers.footprints]
-        listed_in = [surfels, listed, first_env, *shared[1:]]
+        shared = [self.visible, self.camera, workers, self._buffers.footprints]
+        listed_in = [surfels, self.visible, first_env, *shared[1:]]
         passes = (
             (project_footprints, shared),
             (splat_depth, [*shared, self._z_buffer]),
@@ -437,10 +444,3 @@ class SplatRenderer:
         )
         dim = (self.envs, workers)
         return [RecordedLaunch(kernel, dim, inputs, self.device) for kernel, inputs in passes]
-
-    def list_hidden(self, hidden: VisibleList) -> None:
-        """List the culled surfels that lie well behind the surface that ``splat`` just drew."""
-        hidden.count.zero_()
-        workers = self._buffers.workers
-        inputs = [self.visible, self.camera, workers, self._z_buffer, hidden]
-        wp.launch(list_hidden, (self.envs, workers), inputs, device=self.device)

@@ -29,7 +29,6 @@ from ms_slam_env.slam.surfel.rendering import (
 from ms_slam_env.slam.surfel.surfels import (
     MapBuffers,
     SplatCamera,
-    VisibleList,
     allocate,
     rotation_of,
     translation_of,
@@ -281,9 +280,8 @@ def wide_intrinsics(intrinsics: Intrinsics, motions: Float64) -> Intrinsics | No
 class _Reference:
     """Two rendered layers of E maps at one image size, and the points in them."""
 
-    def __init__(self, renderer: SplatRenderer, hidden: VisibleList) -> None:
+    def __init__(self, renderer: SplatRenderer) -> None:
         self.renderer = renderer
-        self.hidden = hidden
         envs, capacity = renderer.envs, 2 * renderer.intrinsics.width * renderer.intrinsics.height
         device = renderer.device
         self.points = allocate(PointCloud, envs, capacity, device)
@@ -294,8 +292,7 @@ class _Reference:
         self.renderer.cull(poses, first_env)
         self._collect(self.renderer.splat(first_env))
         wp.copy(self.points.front_count, self.points.count)
-        self.renderer.list_hidden(self.hidden)
-        self._collect(self.renderer.splat(first_env, self.hidden))
+        self._collect(self.renderer.splat_hidden(first_env))
 
     def _collect(self, layer: ModelView) -> None:
         inputs = [layer.vertices, layer.normals, layer.intensity, self.points]
@@ -314,7 +311,6 @@ class ViewPredictor:
         self.device = buffers.device
         self.workers = buffers.workers
         self._map = buffers
-        self._hidden = allocate(VisibleList, buffers.batch, buffers.capacity, self.device)
         self._references: dict[tuple[int, Intrinsics], _Reference] = {}
         self._single: dict[tuple[int, Intrinsics], SplatRenderer] = {}
         self._outputs: dict[tuple[int, Intrinsics], tuple[wp.array, DeviceViews]] = {}
@@ -386,7 +382,7 @@ class ViewPredictor:
     def _reference(self, envs: int, intrinsics: Intrinsics) -> _Reference:
         key = (envs, intrinsics)
         if key not in self._references:
-            self._references[key] = _Reference(self._renderer(envs, intrinsics), self._hidden)
+            self._references[key] = _Reference(self._renderer(envs, intrinsics))
         return self._references[key]
 
     def _buffers(self, count: int, intrinsics: Intrinsics) -> tuple[wp.array, DeviceViews]:
