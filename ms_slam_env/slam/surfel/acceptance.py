@@ -348,7 +348,8 @@ def is_nearly_accepted(
 
 def doubt(frames: NDArray[np.int32]) -> Float64:
     """What is added to the covariances (B, 6, 6) of poses uncertain for ``frames`` (B,)."""
-    return frames[:, None, None] * np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
+    per_frame: Float64 = np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
+    return per_frame * frames[:, None, None]
 
 
 def accept_any_fit(alignment: Alignment) -> Alignment:

@@ -349,8 +349,8 @@ class ViewPredictor:
         wp.launch(scatter_points, dim, inputs, device=self.device)
         images = [image.flatten() for image in (views.intensity, views.depth, views.normals)]
         columns, threads = threads_per_row(views.intrinsics.width, self.device)
-        dim = (total, views.intrinsics.height, threads)
-        wp.launch(resolve_views, dim, [*shared, keys, columns, *images], device=self.device)
+        pieces = (total, views.intrinsics.height, threads)
+        wp.launch(resolve_views, pieces, [*shared, keys, columns, *images], device=self.device)
 
     def _predict_singly(self, poses: Float64, views: DeviceViews, first_env: int) -> None:
         """Splat the surfels themselves into every view, one view per env at a time.
