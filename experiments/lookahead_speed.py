@@ -29,8 +29,7 @@ from ms_slam_env.slam.surfel import SurfelSlam
 
 STAGES = {
     "cull the surfels": ("rendering.py", "cull"),
-    "render two layers": ("rendering.py", "splat"),
-    "list hidden surfels": ("rendering.py", "list_hidden"),
+    "render two layers": ("rendering.py", "_draw"),
     "collect points": ("view_prediction.py", "_collect"),
     "warp into the views": ("view_prediction.py", "_warp"),
     "copy to the host": ("surfel_map.py", "predict"),

@@ -139,13 +139,13 @@ def measure(
     for step in range(spec.frames):
         images, distances = color[which, step], depth[which, step]
         start, cpu_start = time.perf_counter(), time.process_time()
-        results = slam.track(images, distances)
+        found = slam.track_arrays(images, distances)
         wp.synchronize_device(spec.device)
         if step >= spec.warm_up:
             wall += time.perf_counter() - start
             cpu += time.process_time() - cpu_start
-        estimates.append(np.stack([result.T_world_camera for result in results]))
-        lost += sum(not result.tracking_ok for result in results)
+        estimates.append(found.T_world_camera)
+        lost += int((~found.tracking_ok).sum())
     steps = spec.frames - spec.warm_up
     errors = [
         ate_rmse(np.stack(estimates)[:, env], poses[which[env]], align="none")

@@ -132,6 +132,16 @@ class HostDeviceBuffer:
             # With fewer values, `assign` would silently fill only the beginning of the array.
             self.array.assign(self._values)
 
+    def write_row(self, row: int, values: ArrayLike) -> None:
+        """Set the values of one row, broadcast to its shape."""
+        np.copyto(self._values[row], values)
+        if not self._is_shared:
+            self.array[row].assign(self._values[row])
+
+    def look_row(self, row: int) -> NDArray[Any]:
+        """The values of one row, valid until they change; do not write to them."""
+        return self._values[row] if self._is_shared else self.array[row].numpy()
+
     def zero(self) -> None:
         """Set all values to zero."""
         if self._is_shared:

@@ -15,6 +15,7 @@ from ms_slam_env.slam.surfel.surfels import BLOCK_SIZE
 
 CONFIG = SurfelConfig(max_surfels=3000, compaction_interval=2, unstable_window=3)
 MAPS = SurfelMap(2, SMALL, CONFIG)
+SHARED_MAPS = SurfelMap(2, SMALL, CONFIG, workers=7)  # as on a GPU
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -39,8 +40,8 @@ def random_surfels(rng: np.random.Generator, count: int, extent_m: float) -> dic
     }
 
 
-def set_surfels(surfels: list[dict[str, np.ndarray]]) -> None:
-    MAPS.set_state(
+def set_surfels(surfels: list[dict[str, np.ndarray]], maps: SurfelMap = MAPS) -> None:
+    maps.set_state(
         {
             "counters": {
                 "count": np.int32([len(s["seen"]) for s in surfels]),
@@ -53,11 +54,11 @@ def set_surfels(surfels: list[dict[str, np.ndarray]]) -> None:
 
 
 def visible(
-    poses: np.ndarray, first_env: int, margin_px: float, **more: float
+    poses: np.ndarray, first_env: int, margin_px: float, maps: SurfelMap = MAPS, **more: float
 ) -> list[dict[str, np.ndarray]]:
     """What is listed for each pose."""
-    MAPS.kernels._model_renderer.cull(device_poses(poses), first_env, margin_px, **more)
-    listed = MAPS.kernels._model_renderer.visible
+    maps.kernels._model_renderer.cull(device_poses(poses), first_env, margin_px, **more)
+    listed = maps.kernels._model_renderer.visible
     names = ("index", "position", "normal", "radius")
     return [
         {name: getattr(listed, name).numpy()[k, :count].copy() for name in names}
@@ -93,6 +94,38 @@ def test_the_visible_surfels_are_those_of_the_loop_over_all(seed, margin_px, ext
         assert set(fast[env]["index"]) >= set(expected) - set(doubtful)
         assert (np.diff(fast[env]["index"]) > 0).all()  # the order of the map
         assert looked_at[env] >= len(expected) - len(doubtful)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, st.sampled_from([0.0, 7.0]), st.sampled_from([1.0, 8.0]), st.booleans())
+def test_many_workers_make_the_same_list(seed, margin_px, extent_m, leaves_out):
+    rng = np.random.default_rng(seed)
+    surfels = [random_surfels(rng, int(rng.integers(0, 2900)), extent_m) for _ in range(2)]
+    window = np.sort(rng.integers(0, 9, 2))
+    layers = 2.0 if leaves_out else np.inf
+    for maps in (MAPS, SHARED_MAPS):
+        set_surfels(surfels, maps)
+        maps.active.seen_from.fill_(int(window[0]))
+        maps.active.seen_to.fill_(int(window[1]))
+    for _ in range(2):  # the second looks from elsewhere, over what the first has left behind
+        poses = np.stack([random_pose(rng, extent_m) for _ in range(2)])
+        one, many = (
+            visible(poses, 0, margin_px, maps, layers=layers) for maps in (MAPS, SHARED_MAPS)
+        )
+        for env in range(2):
+            for name, values in one[env].items():
+                np.testing.assert_array_equal(many[env][name], values, err_msg=name)
+        blocks = [maps._buffers.blocks for maps in (MAPS, SHARED_MAPS)]
+        counts = [block.num_listed.numpy().tolist() for block in blocks]
+        assert counts[0] == counts[1]
+        for env, count in enumerate(counts[0]):
+            listed = [block.listed.numpy()[env, :count] for block in blocks]
+            np.testing.assert_array_equal(*listed)
+        # Drawing overwrites the memory that the counts were in.
+        views = [maps.kernels._model_renderer.splat() for maps in (MAPS, SHARED_MAPS)]
+        for name in ("vertices", "normals", "intensity", "color"):  # sums in another order
+            images = [getattr(view, name).numpy() for view in views]
+            np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-4, err_msg=name)
 
 
 def test_of_many_discs_to_a_pixel_a_share_is_listed_by_their_slots():

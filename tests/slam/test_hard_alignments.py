@@ -187,7 +187,7 @@ def test_what_is_usual_follows_accepted_frames_only():
     in_doubt = found.with_status(here, TrackingStatus.UNCERTAIN)
     states.accept(here, in_doubt, 1.0)
     assert states.usual == before
-    states.reset(0, np.eye(4))
+    states.reset(np.array([0]), np.eye(4)[None])
     assert states.usual == fit_of_noise(1)
 
 

@@ -91,3 +91,11 @@ def test_a_buffer_takes_an_array_of_the_device():
     for other in (values[:1], values.astype(np.float64), values.ravel()):
         with pytest.raises(ValueError, match="in place of"):
             buffer.write(wp.array(other, device="cpu"))
+
+
+def test_a_buffer_takes_and_shows_one_row():
+    buffer = HostDeviceBuffer((3, 4), wp.int32, "cpu")
+    buffer.write_row(1, [1, 2, 3, 4])
+    buffer.write_row(2, 7)
+    np.testing.assert_array_equal(buffer.array.numpy(), [[0] * 4, [1, 2, 3, 4], [7] * 4])
+    np.testing.assert_array_equal(buffer.look_row(1), [1, 2, 3, 4])

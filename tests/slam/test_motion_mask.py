@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 import pytest
 
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.metrics import ate_rmse
 from ms_slam_env.sequences import HandheldPath, open_sequence
 from ms_slam_env.slam.surfel.backend import SurfelSlam
+from ms_slam_env.slam.surfel.free_space_mask import APPEARED, SUPPORTED, VANISHED, store, weigh
 from ms_slam_env.slam.surfel.preprocessing import Pieces
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
@@ -182,3 +185,43 @@ def test_a_piece_is_filled_where_most_of_it_is_above_the_limit() -> None:
     filled = pieces.filled(values, 0.5)
     assert (filled[box] == 2.0).all()
     np.testing.assert_array_equal(filled[~box], values[~box])
+
+
+def test_evidence_is_summed_up_as_a_slow_version_does():
+    rng = np.random.default_rng(0)
+    shape = (3, 11, 14)
+    depth = rng.uniform(0.1, 5, shape).astype(np.float32)
+    depth[rng.random(shape) < 0.2] = 0
+    masked = (rng.random(shape) < 0.1).astype(np.int32)
+    found = rng.integers(0, 16, shape).astype(np.int32)
+    found[1] &= ~int(APPEARED)
+    inputs = [wp.array(values, device="cpu") for values in (depth, masked, found)]
+    sums = wp.zeros((*shape[:2], 4), dtype=wp.float64, device="cpu")
+    wp.launch(weigh, shape[:2], [*inputs, sums], device="cpu")
+    for env, (weights, unseen, appeared, vanished) in enumerate(sums.numpy().sum(axis=1)):
+        counts = (depth[env] > 0) & (masked[env] == 0)
+        weight = np.maximum(depth[env].astype(float), 0.3) ** -4.0
+        is_new = (found[env] & SUPPORTED) == 0
+        assert weights == pytest.approx(weight[counts].sum(), rel=1e-6)
+        assert unseen == pytest.approx(weight[counts & is_new].sum(), rel=1e-6)
+        assert vanished == np.count_nonzero(found[env] & VANISHED)
+        has_appeared = (found[env] & APPEARED) > 0
+        around = cv2.blur(has_appeared.astype(np.float32), (3, 3)) > 0.3
+        assert appeared == np.count_nonzero(has_appeared & around)
+        assert (appeared == 0) == (env == 1)
+
+
+def test_images_are_stored_in_their_slots():
+    rng = np.random.default_rng(0)
+    depth, nearest = rng.uniform(0.1, 5, (2, 3, 20)).astype(np.float32)
+    masked = (rng.random((3, 20)) < 0.3).astype(np.int32)
+    past = [np.zeros((3, 6, 20), dtype=np.float32) for _ in range(2)]
+    on_device = [wp.array(values, device="cpu") for values in past]
+    slots = np.int32([4, -1, 0])
+    inputs = [wp.array(values, device="cpu") for values in (slots, depth, nearest, masked)]
+    wp.launch(store, (3, 20), [*inputs, *on_device], device="cpu")
+    for env, slot in ((0, 4), (2, 0)):
+        past[0][env, slot] = np.where(masked[env], -depth[env], depth[env])
+        past[1][env, slot] = nearest[env]
+    for expected, found in zip(past, on_device, strict=True):
+        np.testing.assert_array_equal(found.numpy(), expected)

@@ -77,9 +77,10 @@ def run(
         slam.reset(sequences[env][0][1], row)
     results: list[list[TrackResult]] = []
     for step in range(STEPS):
-        for row, env in enumerate(envs):
-            if (env, step) in RESET:
-                slam.reset(sequences[env][step][1], row)
+        again = [row for row, env in enumerate(envs) if (env, step) in RESET]
+        if again:
+            starts = np.stack([sequences[envs[row]][step][1] for row in again])
+            slam.reset_many(starts, np.array(again))
         color = given(np.stack([sequences[env][step][0].color for env in envs]))
         depth = given(np.stack([sequences[env][step][0].depth for env in envs]))
         poses = np.stack([sequences[env][step][1] for env in envs])
@@ -133,6 +134,29 @@ def test_a_batch_does_what_its_envs_do_alone(sequences, alone, envs, given):
             np.testing.assert_array_equal(
                 together["state"][name][row], single["state"][name][0], err_msg=name
             )
+
+
+def test_several_envs_are_reset_at_once_and_others_left_alone(sequences):
+    pair = [BatchedSurfelSlam(3, CAMERA, CONFIG) for _ in range(2)]
+    poses = np.stack([start_of(env) for env in range(3)])
+    frames = [sequences[env][0][0] for env in range(3)]
+    color, depth = (np.stack([getattr(f, name) for f in frames]) for name in ("color", "depth"))
+    for each in pair:
+        each.reset_many(poses, np.arange(3))
+        for _ in range(2):
+            each.track(color, depth)
+    pair[0].reset_many(poses[[2, 0]], np.array([0, 2]))
+    pair[1].reset(poses[2], 0)
+    pair[1].reset(poses[0], 2)
+    assert [pair[0].map.count(env) > 0 for env in range(3)] == [False, True, False]
+    np.testing.assert_array_equal(pair[0].poses[[0, 2]], poses[[2, 0]])
+    for one, other in zip(*(each.track(color, depth) for each in pair), strict=True):
+        np.testing.assert_array_equal(one.T_world_camera, other.T_world_camera)
+        assert one.tracking_ok
+    counts = [[each.map.count(env) for env in range(3)] for each in pair]
+    assert counts[0] == counts[1]
+    with pytest.raises(InputError, match="must have shape"):
+        pair[0].reset_many(poses, np.array([1]))
 
 
 def test_arrays_hold_what_results_say(sequences):

@@ -359,8 +359,8 @@ def is_nearly_accepted(
 
 def doubt(frames: NDArray[np.int32]) -> Float64:
     """What is added to the covariances (B, 6, 6) of poses uncertain for ``frames`` (B,)."""
-    once = np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
-    return np.asarray(frames[:, None, None] * once, dtype=np.float64)
+    per_frame: Float64 = np.diag([DOUBT_M**2] * 3 + [DOUBT_RAD**2] * 3)
+    return per_frame * frames[:, None, None]
 
 
 NOISE_POWER = 3.0

@@ -242,6 +242,80 @@ def carry_log_odds(
         u += 1
 
 
+WEIGHT_ALL, WEIGHT_UNSEEN, NUM_APPEARED, NUM_VANISHED = (wp.constant(i) for i in range(4))
+NEIGHBOURS = wp.constant(3)  # of nine, that must have appeared where something moves
+NEAREST = wp.constant(0.3)  # metres; what is nearer weighs no more
+
+
+@wp.func
+def mirrored(i: int, size: int) -> int:
+    """Row or column next to the border, which is mirrored at the outermost one."""
+    inside = wp.abs(i)
+    return wp.where(inside < size, inside, 2 * size - 2 - inside)
+
+
+@wp.kernel
+def weigh(
+    depth: wp.array3d[wp.float32],  # (B, h, w) of the grid
+    masked: wp.array3d[wp.int32],
+    found: wp.array3d[wp.int32],
+    sums: wp.array3d[wp.float64],  # (B, h, 4) of a row
+) -> None:
+    """Sum up the evidence of a row: how much readings weigh in alignments, what came and went.
+
+    A reading has appeared if enough of those around have.
+    """
+    b, v = wp.tid()
+    height = depth.shape[1]
+    width = depth.shape[2]
+    all_weights = wp.float64(0.0)
+    unseen = wp.float64(0.0)
+    num_appeared = wp.int32(0)
+    num_vanished = wp.int32(0)
+    for u in range(width):
+        z = depth[b, v, u]
+        evidence = found[b, v, u]
+        if z > 0.0 and masked[b, v, u] == 0:
+            near = wp.max(z, NEAREST)
+            weight = wp.float64(1.0 / (near * near * near * near))
+            all_weights += weight
+            if evidence & SUPPORTED == 0:
+                unseen += weight
+        if evidence & VANISHED != 0:
+            num_vanished += 1
+        if evidence & APPEARED != 0:
+            around = wp.int32(0)
+            for k in range(9):
+                y = mirrored(v + k / 3 - 1, height)
+                x = mirrored(u + k % 3 - 1, width)
+                if found[b, y, x] & APPEARED != 0:
+                    around += 1
+            if around >= NEIGHBOURS:
+                num_appeared += 1
+    sums[b, v, WEIGHT_ALL] = all_weights
+    sums[b, v, WEIGHT_UNSEEN] = unseen
+    sums[b, v, NUM_APPEARED] = wp.float64(num_appeared)
+    sums[b, v, NUM_VANISHED] = wp.float64(num_vanished)
+
+
+@wp.kernel
+def store(
+    slots: wp.array[wp.int32],  # (B,) -1: none
+    depth: wp.array2d[wp.float32],  # (B, h * w)
+    nearest: wp.array2d[wp.float32],
+    masked: wp.array2d[wp.int32],
+    past_depth: wp.array3d[wp.float32],  # (B, PAST, h * w)
+    past_nearest: wp.array3d[wp.float32],
+) -> None:
+    """Put the live images into their slots of the earlier ones; depth of what moves below 0."""
+    b, i = wp.tid()
+    slot = slots[b]
+    if slot >= 0:
+        z = depth[b, i]
+        past_depth[b, slot, i] = z * wp.where(masked[b, i] != 0, -1.0, 1.0)
+        past_nearest[b, slot, i] = nearest[b, i]
+
+
 @wp.kernel
 def hide(
     T_live_model: wp.array[wp.mat44],
@@ -371,10 +445,8 @@ STEP_PER_M = 0.016  # of inverse depth per column of a 160-column image: there p
 COS_CREASE = 0.8  # of the angle between neighbouring normals, likewise
 FEWEST = 12  # pixels of the grid that prove a piece to be moving
 SHARE_APPEARED, SHARE_VANISHED = 0.3, 0.6  # of a piece's pixels for and against
-NEIGHBOURS = 0.3  # share of the pixels around that must have appeared too
 FIRST = NEW * INTERVAL + 1  # frames that have no old ones
 NEAR = 0.8  # of the median depth
-NEAREST = 0.3  # metres; what is nearer weighs no more
 WEIGHT_NEW = 0.2  # of what is new that can lead a pose astray, share of all
 SHARE_NEW = 0.7  # of the pixels of a piece that is taken for new
 SHARE_KNOWN = 0.1  # of its pixels that an earlier frame saw
@@ -430,10 +502,15 @@ class GeometricMotionMask(MotionMask):
         )  # frames since the env was forgotten
         # Frames to come in which what is new is not believed.
         self._alert: NDArray[np.int32] = np.full(batch, FIRST, dtype=np.int32)
-        self._live_odds = np.zeros((batch, *shape), dtype=np.float32)
+        self._sums = SavedBuffer((batch, grid.height, 4), wp.float64, device)
+        self._slots = SavedBuffer(batch, wp.int32, device)
+        # By env; of all others the log-odds (h, w) are such that nothing moves.
+        self._prior: dict[int, Float32] = {}  # as carried from the last frame
+        self._live_odds: dict[int, Float32] = {}
+        self._masks: dict[int, Bool] = {}  # what is masked (h, w)
+        self._new: dict[int, Bool] = {}  # what the last strict look found (h, w)
         self._live_pose = self._pose_before
         self._weight_of_new = np.zeros(batch)
-        self._new = np.zeros((batch, *shape), dtype=bool)  # what the last strict look found
         self._moved: Bool = np.zeros(batch, dtype=bool)  # whether anything did in the last frames
         self._moves_now: Bool = np.zeros(batch, dtype=bool)  # and does in the live ones
         self._is_marked = True  # whether ``LiveFrame.moving`` may hold a mask
@@ -455,48 +532,72 @@ class GeometricMotionMask(MotionMask):
         self._prior = self._carry(T_world_live, is_known & (self._count > 0))
         self._mask_by(self._prior, T_world_live)
 
-    def _carry(self, T_world_live: Float64, is_known: Bool) -> Float32:
-        """Log-odds (B, h, w) of the last frames at the new ones; 0 where nothing moved."""
-        if not self._moved[is_known].any():
-            return np.zeros_like(self._live_odds)
+    def _carry(self, T_world_live: Float64, is_known: Bool) -> dict[int, Float32]:
+        """Log-odds (h, w) of the last frames at the new ones, of the envs where anything moved."""
+        moved = is_known & self._moved
+        if not moved.any():
+            return {}
         self._to_before.write(invert(self._pose_before) @ T_world_live)
         self._launches.launch("carry", carry_log_odds, self._carrying)
-        odds = self._carried.read()
-        odds[~(is_known & self._moved)] = 0.0
-        for env in map(int, np.flatnonzero((odds > MASKED).any(axis=(1, 2)))):
-            odds[env] = self._pieces_of(env).filled(odds[env], MASKED)
-        return odds
+        carried = {}
+        for env in np.flatnonzero(moved).tolist():
+            odds = self._carried.look_row(env).copy()
+            if (odds > MASKED).any():
+                odds = self._pieces_of(env).filled(odds, MASKED)
+            carried[env] = odds
+        return carried
+
+    def _depth_of(self, env: int) -> Float32:
+        """Depth (h, w) of an env's live frame on the grid."""
+        return self._depth.look_row(env)
 
     def _pieces_of(self, env: int) -> Pieces:
         """Pieces of the live frame of an env, cut when they are first asked for."""
         if env not in self._pieces:
             stride = self._grid.stride
             normals = self._live.normals[env].numpy()[::stride, ::stride]
-            depth = self._depth.read()[env]
+            depth = self._depth_of(env)
             self._pieces[env] = Pieces(depth, normals, self._largest_step, COS_CREASE)
         return self._pieces[env]
 
     def find(self, T_world_live: Float64, is_known: Bool, strict: bool = False) -> Bool:
         """See the base class."""
+        is_changed = np.zeros(self._batch, dtype=bool)
         looked = np.concatenate([T_world_live.ravel(), is_known, [strict]])
         if self._looked is not None and np.array_equal(looked, self._looked):
-            return np.zeros(self._batch, dtype=bool)
+            return is_changed
         self._looked = looked
-        before = self._masked.read() > 0
-        odds = self._prior.copy()
-        found = self._compare(T_world_live)
-        for env in map(int, np.flatnonzero(is_known)):
-            is_still = (found[env] & SUPPORTED) > 0
-            self._weight_of_new[env] = self._weight_unseen(env, is_still)
-            change = np.where(is_still, -AGAINST, -FORGETTING)
-            change[self._moves(env, found[env])] = FOR
-            odds[env] = np.clip(odds[env] + change, LEAST, MOST)
-            if strict:
-                is_old = self._count[env] >= FIRST
-                is_new = self._is_new(env, is_still) if is_old else self._is_near(env)
-                odds[env][is_new], self._new[env] = MOST, is_new
+        sums = self._compare(T_world_live)
+        new = sums[:, WEIGHT_UNSEEN] / np.maximum(sums[:, WEIGHT_ALL], 1e-6)
+        self._weight_of_new[is_known] = new[is_known]
+        # All others have too little evidence for anything to move: their log-odds stay below 0.
+        is_open = sums[:, [NUM_APPEARED, NUM_VANISHED]].max(axis=1) >= FEWEST
+        is_open[list(self._prior)] = True
+        odds = dict(self._prior)
+        for env in np.flatnonzero(is_known & (is_open | strict)).tolist():
+            odds[env] = self._odds_after(env, strict)
+        before = self._masks
         self._mask_by(odds, T_world_live)
-        return ((odds > MASKED) & ~before).mean(axis=(1, 2)) > CHANGED
+        for env in odds:
+            is_new = odds[env] > MASKED
+            if env in before:
+                is_new &= ~before[env]
+            is_changed[env] = is_new.mean() > CHANGED
+        return is_changed
+
+    def _odds_after(self, env: int, strict: bool) -> Float32:
+        """Log-odds (h, w) after a look at an env's live frame."""
+        found = self._found.look_row(env)
+        is_still = (found & SUPPORTED) > 0
+        change = np.where(is_still, -AGAINST, -FORGETTING)
+        change[self._moves(env, found)] = FOR
+        prior = self._prior.get(env, np.zeros(found.shape, dtype=np.float32))
+        odds = np.clip(prior + change, LEAST, MOST).astype(np.float32)
+        if strict:
+            is_old = self._count[env] >= FIRST
+            is_new = self._is_new(env, is_still) if is_old else self._is_near(env)
+            odds[is_new], self._new[env] = MOST, is_new
+        return odds
 
     def _moves(self, env: int, found: NDArray[np.int32]) -> Bool:
         """Where (h, w) the evidence of a frame says that something moves.
@@ -505,7 +606,8 @@ class GeometricMotionMask(MotionMask):
         appeared moves wherever several neighbours have.
         """
         appeared = (found & APPEARED) > 0
-        appeared &= cv2.blur(appeared.astype(np.float32), (3, 3)) > NEIGHBOURS
+        around = cv2.boxFilter(appeared.astype(np.float32), -1, (3, 3), normalize=False)
+        appeared &= around >= NEIGHBOURS
         vanished = (found & VANISHED) > 0
         if max(appeared.sum(), vanished.sum()) < FEWEST:
             return np.zeros(found.shape, dtype=bool)
@@ -525,16 +627,9 @@ class GeometricMotionMask(MotionMask):
         is_due = (self._weight_of_new > WEIGHT_NEW) & (self._count % INTERVAL == 0)
         return np.asarray((self._alert > 0) | is_due)
 
-    def _weight_unseen(self, env: int, is_still: Bool) -> float:
-        """Share of the unmasked readings that are not ``is_still`` (h, w), as alignments weigh."""
-        depth = self._depth.read()[env]
-        counts = (depth > 0) & (self._masked.read()[env] == 0)
-        weights = np.maximum(depth[counts], NEAREST) ** -4.0
-        return float(weights[~is_still[counts]].sum() / max(weights.sum(), 1e-6))
-
     def _is_near(self, env: int) -> Bool:
         """Where (h, w) something is clearly nearer than half of the image, with a rim."""
-        depth = self._depth.read()[env]
+        depth = self._depth_of(env)
         if not depth.any():
             return depth > 0
         is_near = (depth > 0) & (depth < NEAR * np.median(depth[depth > 0]))
@@ -543,19 +638,21 @@ class GeometricMotionMask(MotionMask):
 
     def confirm(self, where: Bool) -> None:
         """See the base class."""
-        at_least = np.where(self._new[where], CONFIRMED, 0.0)
-        self._prior[where] = np.maximum(self._prior[where], at_least)
+        for env in np.flatnonzero(where).tolist():
+            at_least = np.where(self._new[env], np.float32(CONFIRMED), np.float32(0))
+            self._prior[env] = np.maximum(self._prior.get(env, np.float32(0)), at_least)
         self._alert[where] = np.maximum(self._alert[where], INTERVAL)
 
-    def _compare(self, T_world_live: Float64) -> NDArray[np.int32]:
-        """Evidence (B, h, w) of the live frames, taken at poses (B, 4, 4)."""
+    def _compare(self, T_world_live: Float64) -> Float64:
+        """Find the evidence of the live frames, taken at poses (B, 4, 4); sums (B, 4) of it."""
         to_past = invert(self._past_poses) @ T_world_live[:, None]
         self._to_past.write(to_past)
         self._from_past.write(invert(to_past))
         self._age.write(self._ages())
         self._launches.launch("appeared", find_appeared, self._appearing)
         self._launches.launch("vanished", find_vanished, self._vanishing)
-        return self._found.read()
+        self._launches.launch("weigh", weigh, self._weighing)
+        return np.asarray(self._sums.look().sum(axis=1))
 
     # Threads and arguments of the kernels, as ``KernelLaunchCache`` records them.
 
@@ -582,6 +679,18 @@ class GeometricMotionMask(MotionMask):
         threads = (batch, PAST, self._grid.height)
         return threads, [*images, *poses, self._grid, *_flat(self._found)]
 
+    def _storing(self) -> tuple[tuple[int, ...], list[Any]]:
+        batch, pixels = self._batch, self._grid.height * self._grid.width
+        live = [self._depth.array, self._nearest.array, self._masked.array]
+        past = [self._past_depth.array, self._past_nearest.array]
+        images = [image.reshape((batch, pixels)) for image in live]
+        images += [image.reshape((batch, int(PAST), pixels)) for image in past]
+        return (batch, pixels), [self._slots.array, *images]
+
+    def _weighing(self) -> tuple[tuple[int, ...], list[Any]]:
+        images = [self._depth.array, self._masked.array, self._found.array]
+        return self._rows, [*images, self._sums.array]
+
     def _enlarging(self) -> tuple[tuple[int, ...], list[Any]]:
         rows = (self._batch, self._grid.live_height)
         return rows, [*_flat(self._masked), self._grid, self._live.moving.flatten()]
@@ -593,14 +702,18 @@ class GeometricMotionMask(MotionMask):
         back = (stored - 1 - slots) % PAST  # how many are newer
         return np.where(slots < stored, np.where(back < NEW, RECENT, OLD), UNUSED)
 
-    def _mask_by(self, odds: Float32, T_world_live: Float64) -> None:
-        """Mask the live frames at poses (B, 4, 4) by log-odds (B, h, w), with a rim of a pixel."""
+    def _mask_by(self, odds: dict[int, Float32], T_world_live: Float64) -> None:
+        """Mask the live frames at poses (B, 4, 4) by log-odds (h, w), with a rim of a pixel."""
         self._live_odds, self._live_pose = odds, T_world_live
-        is_masked = odds > MASKED
-        self._moves_now = np.asarray(is_masked.any(axis=(1, 2)))
-        if self._moves_now.any():
-            is_masked = np.array([cv2.dilate(each.astype(np.uint8), _RIM) for each in is_masked])
-        self._masked.write(is_masked)
+        before, self._masks = self._masks, {}
+        for env, values in odds.items():
+            is_masked = values > MASKED
+            if is_masked.any():
+                self._masks[env] = np.asarray(cv2.dilate(is_masked.astype(np.uint8), _RIM) > 0)
+        for env in {**before, **self._masks}:
+            self._masked.write_row(env, self._masks.get(env, 0))
+        self._moves_now = np.zeros(self._batch, dtype=bool)
+        self._moves_now[list(self._masks)] = True
 
     def hide(self, view: ModelView, T_world_model: Float64) -> bool:
         """See the base class."""
@@ -625,29 +738,29 @@ class GeometricMotionMask(MotionMask):
         if due.any():
             slots = self._count // INTERVAL % PAST
             self._past_poses[due, slots[due]] = T_world_live[due]
-            depth = self._depth.read()
-            depth[self._masked.read() > 0] *= -1.0  # of what moves
-            _store(self._past_depth, due, slots, depth)
-            _store(self._past_nearest, due, slots, self._nearest.read())
+            self._slots.write(np.where(due, slots, -1))
+            self._launches.launch("store", store, self._storing)
         self._pose_before[good] = T_world_live[good]
         self._moved[good] = self._moves_now[good]
-        if self._moved.any():
-            odds, depths = self._odds.read(), self._depth_before.read()
-            odds[good], depths[good] = self._live_odds[good], self._depth.read()[good]
-            self._odds.write(odds)
-            self._depth_before.write(depths)
+        for env in np.flatnonzero(good & self._moved).tolist():
+            self._odds.write_row(env, self._live_odds[env])
+            self._depth_before.write_row(env, self._depth_of(env))
         self._count[good] += 1
         self._alert[good] = np.maximum(self._alert[good] - 1, 0)
 
     def share(self) -> Float64:
         """See the base class."""
-        is_read = self._depth.read() > 0
-        masked = (self._live_odds > MASKED) & is_read
-        return np.asarray(masked.sum(axis=(1, 2)) / np.maximum(is_read.sum(axis=(1, 2)), 1))
+        shares = np.zeros(self._batch)
+        for env, odds in self._live_odds.items():
+            is_read = self._depth_of(env) > 0
+            shares[env] = ((odds > MASKED) & is_read).sum() / max(is_read.sum(), 1)
+        return shares
 
     def mask(self, env: int) -> Bool | None:
         """See the base class."""
-        return self._masked.read()[env] > 0
+        if env in self._masks:
+            return self._masks[env].copy()
+        return np.zeros((self._grid.height, self._grid.width), dtype=bool)
 
     def still(self, depth: Any) -> Any:
         """See the base class."""
@@ -655,10 +768,12 @@ class GeometricMotionMask(MotionMask):
             return depth
         if isinstance(depth, wp.array):
             return self._still_on_device(depth)
-        masked = self._masked.look() > 0
-        step = -(-depth.shape[1] // masked.shape[1])
-        whole = masked.repeat(step, axis=1).repeat(step, axis=2)
-        return np.where(whole[:, : depth.shape[1], : depth.shape[2]], np.float32(0), depth)
+        left = depth.copy()
+        step = -(-depth.shape[1] // self._grid.height)
+        for env, masked in self._masks.items():
+            whole = masked.repeat(step, axis=0).repeat(step, axis=1)
+            left[env][whole[: depth.shape[1], : depth.shape[2]]] = 0
+        return left
 
     def _still_on_device(self, depth: wp.array) -> wp.array:
         """The same of images on the device."""
@@ -672,13 +787,6 @@ class GeometricMotionMask(MotionMask):
 
 def _flat(*buffers: SavedBuffer) -> list[wp.array]:
     return [buffer.array.flatten() for buffer in buffers]
-
-
-def _store(past: SavedBuffer, due: Bool, slots: NDArray[Any], live: Float32) -> None:
-    """Put the images of the envs that are due into their slots."""
-    images = past.read()
-    images[due, slots[due]] = live[due]
-    past.write(images)
 
 
 def make_motion_mask(

@@ -14,6 +14,7 @@ import math
 from ms_slam_env._runtime.warp import RecordedLaunch
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
+from ms_slam_env.slam.surfel.device import fetch, put
 from ms_slam_env.slam.surfel.surfels import (
     BLOCK_SIZE,
     CullingBlocks,
@@ -179,29 +180,169 @@ def cull(
     """List the living surfels of a window in front of the camera, facing it, within its frustum.
 
     Those of the blocks that ``list_visible_blocks`` listed; ``poses[k]`` is T_world_camera of env
-    ``first_env + k``. A single worker, as on the CPU, keeps the order of the map. Of more than
-    ``layers`` surfaces of discs so many are left.
+    ``first_env + k``. For a single worker, as on the CPU; where many share an env,
+    ``count_visible`` and ``place_visible`` make the same list. Of more than ``layers`` surfaces of
+    discs so many are left.
     """
-    k, worker = wp.tid()
+    k = wp.tid()
     b = first_env + k
     frustum = frustum_of(poses[k], camera, margin_px)
     frustum.layers = layers
     count = surfels.count[b]
     seen_from = window.seen_from[b]
     seen_to = window.seen_to[b]
-    slots = blocks.num_listed[k] * BLOCK_SIZE
+    for block in range(blocks.num_listed[k]):
+        i = int(blocks.listed[k, block] * BLOCK_SIZE)
+        end = wp.min(i + BLOCK_SIZE, count)
+        while i < end:
+            i += list_some_visible(surfels, b, i, end, frustum, seen_from, seen_to, k, visible)
+
+
+# Many workers count first, so that each knows the places of its surfels: a counter that all of them
+# raise would take ten times as long, and put the list in another order every time.
+
+TOGETHER = wp.constant(4)  # neighbours that one thread looks at
+PER_BLOCK = wp.constant(BLOCK_SIZE // 4)
+
+
+@wp.kernel
+def mark_blocks(blocks: CullingBlocks, workers: int, starts: wp.array2d[wp.int32]) -> None:
+    """Count the listed blocks, each after its own place in ``starts`` (E, blocks + 1)."""
+    k, worker = wp.tid()
     j = int(worker)
-    while j < slots:
-        block = j / BLOCK_SIZE
-        i = blocks.listed[k, block] * BLOCK_SIZE + j - block * BLOCK_SIZE
-        looked_at = 1
-        if i < count:
-            end = wp.min((i / BLOCK_SIZE + 1) * BLOCK_SIZE, count)
-            end = wp.where(workers == 1, end, i + 1)
-            looked_at = list_some_visible(
-                surfels, b, i, end, frustum, seen_from, seen_to, k, visible
-            )
-        j += wp.where(workers == 1, looked_at, workers)
+    while j < blocks.num_listed[k]:
+        starts[k, blocks.listed[k, j] + 1] = 1
+        j += workers
+
+
+@wp.kernel
+def order_blocks(blocks: CullingBlocks, workers: int, starts: wp.array2d[wp.int32]) -> None:
+    """List the blocks in the order of the map, by the running sum of what was marked."""
+    k, worker = wp.tid()
+    block = int(worker)
+    while block < starts.shape[1] - 1:
+        if starts[k, block + 1] > starts[k, block]:
+            blocks.listed[k, starts[k, block] - starts[k, 0]] = block
+        block += workers
+
+
+@wp.func
+def turned(R: wp.mat33, p: wp.vec3, row: int) -> float:
+    """Component of R p, with the sums of ``list_some_visible``."""
+    return R[row, 0] * p[0] + R[row, 1] * p[1] + R[row, 2] * p[2]
+
+
+@wp.func
+def in_camera(frustum: Frustum, p: wp.vec3) -> wp.vec3:
+    """A point in the camera's frame."""
+    x = turned(frustum.R, p, 0) + frustum.t[0]
+    y = turned(frustum.R, p, 1) + frustum.t[1]
+    return wp.vec3(x, y, turned(frustum.R, p, 2) + frustum.t[2])
+
+
+@wp.func
+def facing(frustum: Frustum, n: wp.vec3) -> wp.vec3:
+    """A normal in the camera's frame."""
+    return wp.vec3(turned(frustum.R, n, 0), turned(frustum.R, n, 1), turned(frustum.R, n, 2))
+
+
+@wp.func
+def is_visible(
+    surfels: Surfels, b: int, i: int, frustum: Frustum, seen_from: int, seen_to: int
+) -> bool:
+    """Whether ``list_some_visible`` lists surfel i."""
+    p = in_camera(frustum, fetch(surfels.position, b, i))
+    x, y, z = p[0], p[1], p[2]
+    inside = z > frustum.z_near and z < frustum.z_far
+    inside = inside and x > frustum.low_u * z and x < frustum.high_u * z
+    inside = inside and y > frustum.low_v * z and y < frustum.high_v * z
+    seen = fetch(surfels.seen, b, i)
+    inside = inside and fetch(surfels.confidence, b, i) > 0.0
+    inside = inside and seen >= seen_from and seen <= seen_to
+    if inside:
+        n = facing(frustum, fetch(surfels.normal, b, i))
+        inside = n[0] * x + n[1] * y + n[2] * z < 0.0
+    if inside and frustum.layers < wp.inf:
+        radius_px = fetch(surfels.radius, b, i) * frustum.focal / z
+        draw = float((wp.uint32(i) * wp.uint32(2654435769)) >> wp.uint32(8)) / 16777216.0
+        inside = draw < frustum.layers * radius_px * radius_px
+    return inside
+
+
+@wp.func
+def first_of(blocks: CullingBlocks, k: int, part: int) -> int:
+    """First of the surfels that thread ``part`` of those over the listed blocks looks at."""
+    block = part / PER_BLOCK
+    return blocks.listed[k, block] * BLOCK_SIZE + (part - block * PER_BLOCK) * TOGETHER
+
+
+@wp.kernel
+def count_visible(
+    surfels: Surfels,
+    blocks: CullingBlocks,
+    first_env: int,
+    poses: wp.array[wp.mat44],
+    camera: SplatCamera,
+    margin_px: float,
+    workers: int,
+    layers: float,
+    window: SeenWindow,
+    starts: wp.array2d[wp.int32],  # (E, parts + 1), zeros
+) -> None:
+    """Count what ``cull`` would list of every part of the listed blocks, after the part's place."""
+    k, worker = wp.tid()
+    b = first_env + k
+    frustum = frustum_of(poses[k], camera, margin_px)
+    frustum.layers = layers
+    count = surfels.count[b]
+    part = int(worker)
+    while part < blocks.num_listed[k] * PER_BLOCK:
+        first = first_of(blocks, k, part)
+        found = wp.int32(0)
+        for i in range(first, wp.min(first + TOGETHER, count)):
+            if is_visible(surfels, b, i, frustum, window.seen_from[b], window.seen_to[b]):
+                found += 1
+        starts[k, part + 1] = found
+        part += workers
+
+
+@wp.kernel
+def place_visible(
+    surfels: Surfels,
+    blocks: CullingBlocks,
+    first_env: int,
+    poses: wp.array[wp.mat44],
+    camera: SplatCamera,
+    margin_px: float,
+    workers: int,
+    layers: float,
+    window: SeenWindow,
+    starts: wp.array2d[wp.int32],
+    visible: VisibleList,
+) -> None:
+    """List them in the order of the map, by the running sum of what was counted."""
+    k, worker = wp.tid()
+    b = first_env + k
+    frustum = frustum_of(poses[k], camera, margin_px)
+    frustum.layers = layers
+    count = surfels.count[b]
+    parts = blocks.num_listed[k] * PER_BLOCK
+    if worker == 0:
+        visible.count[k] = starts[k, parts] - starts[k, 0]
+    part = int(worker)
+    while part < parts:
+        first = first_of(blocks, k, part)
+        place = starts[k, part] - starts[k, 0]
+        if starts[k, part + 1] > starts[k, part]:
+            for i in range(first, wp.min(first + TOGETHER, count)):
+                if is_visible(surfels, b, i, frustum, window.seen_from[b], window.seen_to[b]):
+                    p = in_camera(frustum, fetch(surfels.position, b, i))
+                    put(visible.index, k, place, i)
+                    put(visible.position, k, place, p)
+                    put(visible.normal, k, place, facing(frustum, fetch(surfels.normal, b, i)))
+                    put(visible.radius, k, place, fetch(surfels.radius, b, i))
+                    place += 1
+        part += workers
 
 
 class FrustumCuller:
@@ -219,9 +360,23 @@ class FrustumCuller:
         shared = [buffers.surfels, buffers.blocks, 0, none, camera, 0.0]
         shared.append(buffers.workers)
         dim, device = (envs, buffers.workers), buffers.device
-        self._launches = [
-            RecordedLaunch(list_visible_blocks, dim, shared, device),
-            RecordedLaunch(cull, dim, [*shared, math.inf, window, buffers.visible], device),
+        self._blocks = [RecordedLaunch(list_visible_blocks, dim, shared, device)]
+        rule = [*shared, math.inf, window]
+        if buffers.workers == 1:
+            self._surfels = [RecordedLaunch(cull, envs, [*rule, buffers.visible], device)]
+            return
+        num = buffers.blocks.listed.shape[1]
+        spare = buffers.footprints  # which nobody needs until what is listed here is drawn
+        self._block_starts = spare.left.flatten()[: envs * (num + 1)].reshape((envs, num + 1))
+        size = envs, num * int(PER_BLOCK) + 1
+        self._starts = spare.right.flatten()[: math.prod(size)].reshape(size)
+        marks = [buffers.blocks, buffers.workers, self._block_starts]
+        self._blocks += [
+            RecordedLaunch(kernel, dim, marks, device) for kernel in (mark_blocks, order_blocks)
+        ]
+        self._surfels = [
+            RecordedLaunch(count_visible, dim, [*rule, self._starts], device),
+            RecordedLaunch(place_visible, dim, [*rule, self._starts, buffers.visible], device),
         ]
 
     def __call__(
@@ -233,15 +388,29 @@ class FrustumCuller:
     ) -> None:
         """Fill the list for ``poses`` (envs,) T_world_camera of the envs from ``first_env`` on."""
         self.list_blocks(poses, first_env, margin_px)
-        self._launches[1].set_param("layers", layers)
-        self._buffers.visible.count.zero_()
-        self._launches[1].launch()
+        for launch in self._surfels:
+            launch.set_param("layers", layers)
+        if self._buffers.workers == 1:
+            self._buffers.visible.count.zero_()
+            self._surfels[0].launch()
+        else:
+            self._summed(self._starts, *self._surfels)
 
     def list_blocks(self, poses: wp.array, first_env: int = 0, margin_px: float = 0.0) -> None:
         """List only the blocks of which a surfel may be seen."""
         self._buffers.blocks.num_listed.zero_()
-        for launch in self._launches:
+        for launch in (self._blocks[0], *self._surfels):
             launch.set_param("first_env", first_env)
             launch.set_param("poses", poses)
             launch.set_param("margin_px", margin_px)
-        self._launches[0].launch()
+        self._blocks[0].launch()
+        if self._buffers.workers > 1:
+            self._summed(self._block_starts, *self._blocks[1:])
+
+    def _summed(self, starts: wp.array, count: RecordedLaunch, place: RecordedLaunch) -> None:
+        """Count, sum up, and place what was counted."""
+        starts.zero_()
+        count.launch()
+        flat = starts.flatten()
+        wp.utils.array_scan(flat, flat, inclusive=True)
+        place.launch()

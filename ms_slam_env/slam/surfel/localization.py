@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import wp
@@ -106,12 +106,12 @@ class CameraStates(Stateful):
             shown.flags.writeable = False
             setattr(self, name, shown)
 
-    def reset(self, env: int, pose: ArrayLike) -> None:
-        """Start one env anew at a pose (4, 4)."""
+    def reset(self, envs: NDArray[np.integer[Any]], poses: Float64) -> None:
+        """Start the ``envs`` (N,) anew at poses (N, 4, 4)."""
         fresh = CameraStates(1)
         for name, array in self._own.items():
-            array[env] = getattr(fresh, name)[0]
-        self._own["poses"][env] = pose
+            array[envs] = getattr(fresh, name)[0]
+        self._own["poses"][envs] = poses
 
     def start(self, where: NDArray[np.bool_]) -> None:
         """Take note that the envs ``where`` (B,) have a first frame."""

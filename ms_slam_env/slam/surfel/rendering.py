@@ -23,7 +23,7 @@ from ms_slam_env._runtime.warp import RecordedLaunch
 from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.native import native_source
-from ms_slam_env.slam.surfel.device import fetch, put, raise_to
+from ms_slam_env.slam.surfel.device import fetch, put, raise_to, threads_per_row
 from ms_slam_env.slam.surfel.frustum_culling import FrustumCuller
 from ms_slam_env.slam.surfel.surfels import (
     MapBuffers,
@@ -67,58 +67,61 @@ def project_footprints(
     """Footprints of the listed surfels.
 
     Several short loops without branches: the compiler turns them into operations on many surfels
-    at once, which it does not for loops that write many arrays.
+    at once, which it does not for loops that write many arrays. Of many workers each takes one
+    surfel at a time, so that neighbours fetch and write neighbours.
     """
     k, worker = wp.tid()
     fx = camera.focal[0]
     fy = camera.focal[1]
     cx = camera.centre[0]
     cy = camera.centre[1]
-    share = (visible.count[k] + workers - 1) / workers
-    start = worker * share
-    end = wp.min(start + share, visible.count[k])
-    j = int(start)
-    while j < end:
-        p = fetch(visible.position, k, j)
-        inverse = 1.0 / p[2]
-        put(footprints.inverse, k, j, inverse)
-        put(footprints.u, k, j, fx * p[0] * inverse + cx)
-        put(footprints.v, k, j, fy * p[1] * inverse + cy)
-        j += 1
-    j = int(start)
-    while j < end:
-        n = fetch(visible.normal, k, j)
-        # n . ray = (n . p) / z for rays with z = 1: inverse depth is (n / (n . p)) . ray.
-        plane = 1.0 / wp.min(wp.dot(n, fetch(visible.position, k, j)), -1.0e-6)
-        put(footprints.slope_u, k, j, n[0] * plane / fx)
-        put(footprints.slope_v, k, j, n[1] * plane / fy)
-        j += 1
-    j = int(start)
-    while j < end:
-        z = fetch(visible.position, k, j)[2]
-        radius = drawn_radius(fetch(visible.radius, k, j), z, camera)
-        put(footprints.rim, k, j, radius * radius)
-        j += 1
-    j = int(start)
-    while j < end:
-        p = fetch(visible.position, k, j)
-        n = fetch(visible.normal, k, j)
-        radius = drawn_radius(fetch(visible.radius, k, j), p[2], camera)
-        reach = half_extent(p, n, p[0], n[0], radius, fx)
-        u = fx * p[0] / p[2] + cx
-        put(footprints.left, k, j, wp.max(floor_int(u - reach) + 1, 0))
-        put(footprints.right, k, j, wp.min(floor_int(u + reach), camera.width - 1))
-        j += 1
-    j = int(start)
-    while j < end:
-        p = fetch(visible.position, k, j)
-        n = fetch(visible.normal, k, j)
-        radius = drawn_radius(fetch(visible.radius, k, j), p[2], camera)
-        reach = half_extent(p, n, p[1], n[1], radius, fy)
-        v = fy * p[1] / p[2] + cy
-        put(footprints.top, k, j, wp.max(floor_int(v - reach) + 1, 0))
-        put(footprints.bottom, k, j, wp.min(floor_int(v + reach), camera.height - 1))
-        j += 1
+    count = visible.count[k]
+    start = int(worker)
+    while start < count:
+        end = wp.where(workers == 1, count, start + 1)
+        j = int(start)
+        while j < end:
+            p = fetch(visible.position, k, j)
+            inverse = 1.0 / p[2]
+            put(footprints.inverse, k, j, inverse)
+            put(footprints.u, k, j, fx * p[0] * inverse + cx)
+            put(footprints.v, k, j, fy * p[1] * inverse + cy)
+            j += 1
+        j = int(start)
+        while j < end:
+            n = fetch(visible.normal, k, j)
+            # n . ray = (n . p) / z for rays with z = 1: inverse depth is (n / (n . p)) . ray.
+            plane = 1.0 / wp.min(wp.dot(n, fetch(visible.position, k, j)), -1.0e-6)
+            put(footprints.slope_u, k, j, n[0] * plane / fx)
+            put(footprints.slope_v, k, j, n[1] * plane / fy)
+            j += 1
+        j = int(start)
+        while j < end:
+            z = fetch(visible.position, k, j)[2]
+            radius = drawn_radius(fetch(visible.radius, k, j), z, camera)
+            put(footprints.rim, k, j, radius * radius)
+            j += 1
+        j = int(start)
+        while j < end:
+            p = fetch(visible.position, k, j)
+            n = fetch(visible.normal, k, j)
+            radius = drawn_radius(fetch(visible.radius, k, j), p[2], camera)
+            reach = half_extent(p, n, p[0], n[0], radius, fx)
+            u = fx * p[0] / p[2] + cx
+            put(footprints.left, k, j, wp.max(floor_int(u - reach) + 1, 0))
+            put(footprints.right, k, j, wp.min(floor_int(u + reach), camera.width - 1))
+            j += 1
+        j = int(start)
+        while j < end:
+            p = fetch(visible.position, k, j)
+            n = fetch(visible.normal, k, j)
+            radius = drawn_radius(fetch(visible.radius, k, j), p[2], camera)
+            reach = half_extent(p, n, p[1], n[1], radius, fy)
+            v = fy * p[1] / p[2] + cy
+            put(footprints.top, k, j, wp.max(floor_int(v - reach) + 1, 0))
+            put(footprints.bottom, k, j, wp.min(floor_int(v + reach), camera.height - 1))
+            j += 1
+        start += wp.where(workers == 1, count, workers)
 
 
 Sums: Any = wp.types.vector(length=8, dtype=wp.float32)
@@ -144,17 +147,23 @@ def splat_depth(
     footprints: SplatFootprints,
     z_buffer: wp.array[wp.float32],
 ) -> None:
-    """Inverse depth (E * H * W) of the nearest disc at every pixel; list the discs on a pixel."""
+    """Inverse depth (E * H * W) of the nearest disc at every pixel; list the discs on a pixel.
+
+    Many workers leave a gap, -1, where a disc is on none: a counter would be in great demand.
+    """
     k, worker = wp.tid()
     width = camera.width
     image = k * camera.height * width
     count = visible.count[k]
     j = int(worker)
+    if workers > 1 and worker == 0:
+        footprints.num_drawn[k] = count
     while j < count:
         left = fetch(footprints.left, k, j)
         right = fetch(footprints.right, k, j)
         row = fetch(footprints.top, k, j)
         bottom = fetch(footprints.bottom, k, j)
+        hits = int(0)
         if left <= right and row <= bottom:
             centre_u = fetch(footprints.u, k, j)
             centre_v = fetch(footprints.v, k, j)
@@ -163,7 +172,6 @@ def splat_depth(
             slope_v = fetch(footprints.slope_v, k, j)
             rim = fetch(footprints.rim, k, j)
             nearly_rim = rim * 1.00001  # ``splat_attributes`` rounds otherwise
-            hits = int(0)
             z = 1.0 / centre_inverse
             pixel_u = z / camera.focal[0]
             pixel_v = z / camera.focal[1]
@@ -179,8 +187,10 @@ def splat_depth(
                     raise_to(z_buffer, image + row * width + u, inverse)
                     u += 1
                 row += 1
-            if hits > 0:
-                put(footprints.drawn, k, wp.atomic_add(footprints.num_drawn, k, 1), j)
+        if workers > 1:
+            put(footprints.drawn, k, j, wp.where(hits > 0, j, -1))
+        elif hits > 0:
+            put(footprints.drawn, k, wp.atomic_add(footprints.num_drawn, k, 1), j)
         j += workers
 
 
@@ -206,11 +216,12 @@ def splat_attributes(
     count = footprints.num_drawn[k]
     d = int(worker)
     while d < count:
-        j = fetch(footprints.drawn, k, d)
+        drawn = fetch(footprints.drawn, k, d)
+        j = wp.max(drawn, 0)
         left = fetch(footprints.left, k, j)
         right = fetch(footprints.right, k, j)
         row = fetch(footprints.top, k, j)
-        bottom = fetch(footprints.bottom, k, j)
+        bottom = wp.where(drawn < 0, row - 1, fetch(footprints.bottom, k, j))
         centre_u = fetch(footprints.u, k, j)
         centre_v = fetch(footprints.v, k, j)
         centre_inverse = fetch(footprints.inverse, k, j)
@@ -247,30 +258,28 @@ def splat_attributes(
 
 
 @wp.kernel
-def list_hidden(
+def leave_hidden(
     visible: VisibleList,
     camera: SplatCamera,
     workers: int,
     z_buffer: wp.array[wp.float32],
-    hidden: VisibleList,
+    footprints: SplatFootprints,
 ) -> None:
-    """List the visible surfels well behind the front surface at their own pixel."""
+    """Leave only the surfels to draw that lie well behind the front surface at their own pixel."""
     k, worker = wp.tid()
     image = k * camera.height * camera.width
     for j in range(worker, visible.count[k], workers):
         p = visible.position[k, j]
         u = floor_int(camera.focal[0] * p[0] / p[2] + camera.centre[0] + 0.5)
         v = floor_int(camera.focal[1] * p[1] / p[2] + camera.centre[1] + 0.5)
+        is_hidden = bool(False)
         if u >= 0 and u < camera.width and v >= 0 and v < camera.height:
             inverse = z_buffer[image + v * camera.width + u]
             if inverse > 0.0:
                 front = 1.0 / inverse
-                if p[2] > front + 2.0 * depth_tolerance(camera.tolerance_m, front):
-                    slot = wp.atomic_add(hidden.count, k, 1)
-                    hidden.index[k, slot] = visible.index[k, j]
-                    hidden.position[k, slot] = p
-                    hidden.normal[k, slot] = visible.normal[k, j]
-                    hidden.radius[k, slot] = visible.radius[k, j]
+                is_hidden = p[2] > front + 2.0 * depth_tolerance(camera.tolerance_m, front)
+        if not is_hidden:
+            footprints.right[k, j] = -1  # before the first column
 
 
 @wp.func_native(native_source("splatting", "resolve_row"))
@@ -279,28 +288,33 @@ def resolve_row(
     camera: SplatCamera,
     y: float,
     first: int,
+    start: int,
+    end: int,
     vertices: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
     intensity: wp.array[wp.float32],
     color: wp.array[wp.vec3],
 ) -> None:
-    """Resolve the row of pixels from ``first`` on, on which the rays have ``y`` at z = 1."""
+    """Resolve columns of the row from pixel ``first`` on, whose rays have ``y`` at z = 1."""
 
 
 @wp.kernel
 def resolve(
     sums: wp.array[Sums],
     camera: SplatCamera,
+    columns: int,  # per thread
     vertices: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
     intensity: wp.array[wp.float32],
     color: wp.array[wp.vec3],
 ) -> None:
     """Divide the sums by their weights; pixels that no disc covers become 0."""
-    k, v = wp.tid()
+    k, v, piece = wp.tid()
     y = (float(v) - camera.centre[1]) / camera.focal[1]
     first = (k * camera.height + v) * camera.width
-    resolve_row(sums, camera, y, first, vertices, normals, intensity, color)
+    start = piece * columns
+    end = wp.min(start + columns, camera.width)
+    resolve_row(sums, camera, y, first, start, end, vertices, normals, intensity, color)
 
 
 @dataclass(frozen=True)
@@ -368,9 +382,13 @@ class SplatRenderer:
         self._z_buffer = wp.zeros(pixels, dtype=wp.float32, device=self.device)
         self._sums = wp.zeros(pixels, dtype=Sums, device=self.device)
         self._culler = FrustumCuller(buffers, envs, self.camera, window)
-        self._splats: dict[tuple[int, int], list[RecordedLaunch]] = {}
+        self._splats: dict[int, list[RecordedLaunch]] = {}
         images = [a.flatten() for a in (view.vertices, view.normals, view.intensity, view.color)]
-        dim, inputs = (envs, intrinsics.height), [self._sums, self.camera, *images]
+        columns, threads = threads_per_row(intrinsics.width, self.device)
+        dim, inputs = (
+            (envs, intrinsics.height, threads),
+            [self._sums, self.camera, columns, *images],
+        )
         self._resolve = RecordedLaunch(resolve, dim, inputs, self.device)
 
     def _new_view(self) -> ModelView:
@@ -392,24 +410,33 @@ class SplatRenderer:
         """
         self._culler(poses, first_env, margin_px, layers)
 
-    def splat(self, first_env: int = 0, listed: VisibleList | None = None) -> ModelView:
-        """Draw the surfels that ``cull`` listed, or those of another list."""
-        listed = self.visible if listed is None else listed
+    def splat(self, first_env: int = 0) -> ModelView:
+        """Draw the surfels that ``cull`` listed."""
+        return self._draw(first_env, 0)
+
+    def splat_hidden(self, first_env: int = 0) -> ModelView:
+        """Draw those of them that lie well behind the surface that ``splat`` just drew."""
+        inputs = [self.visible, self.camera, self._buffers.workers, self._z_buffer]
+        dim = (self.envs, self._buffers.workers)
+        wp.launch(leave_hidden, dim, [*inputs, self._buffers.footprints], device=self.device)
+        return self._draw(first_env, 1)
+
+    def _draw(self, first_env: int, first_pass: int) -> ModelView:
+        """Make the passes over the listed surfels from one of them on."""
         self._z_buffer.zero_()
         self._sums.zero_()
         self._buffers.footprints.num_drawn.zero_()
-        key = (id(listed), first_env)
-        if key not in self._splats:
-            self._splats[key] = self._record_splats(listed, first_env)
-        for launch in (*self._splats[key], self._resolve):
+        if first_env not in self._splats:
+            self._splats[first_env] = self._record_splats(first_env)
+        for launch in (*self._splats[first_env][first_pass:], self._resolve):
             launch.launch()
         return self.view
 
-    def _record_splats(self, listed: VisibleList, first_env: int) -> list[RecordedLaunch]:
-        """The three passes over the surfels of a list."""
+    def _record_splats(self, first_env: int) -> list[RecordedLaunch]:
+        """The three passes over the listed surfels."""
         surfels, workers = self._buffers.surfels, self._buffers.workers
-        shared = [listed, self.camera, workers, self._buffers.footprints]
-        listed_in = [surfels, listed, first_env, *shared[1:]]
+        shared = [self.visible, self.camera, workers, self._buffers.footprints]
+        listed_in = [surfels, self.visible, first_env, *shared[1:]]
         passes = (
             (project_footprints, shared),
             (splat_depth, [*shared, self._z_buffer]),
@@ -417,10 +444,3 @@ class SplatRenderer:
         )
         dim = (self.envs, workers)
         return [RecordedLaunch(kernel, dim, inputs, self.device) for kernel, inputs in passes]
-
-    def list_hidden(self, hidden: VisibleList) -> None:
-        """List the culled surfels that lie well behind the surface that ``splat`` just drew."""
-        hidden.count.zero_()
-        workers = self._buffers.workers
-        inputs = [self.visible, self.camera, workers, self._z_buffer, hidden]
-        wp.launch(list_hidden, (self.envs, workers), inputs, device=self.device)

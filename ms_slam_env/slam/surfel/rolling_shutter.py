@@ -18,8 +18,10 @@ mapped anew once the second one has been found.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.warp import RecordedLaunch
@@ -142,6 +144,6 @@ class Shutter(Saved):
         share = self._readout_s / np.where(is_later, self._intervals, np.inf)
         return self._leveller(taken, share[:, None] * np.stack([se3_log(T) for T in motions]))
 
-    def forget(self, env: int) -> None:
-        """Know no earlier frame of an env."""
-        self._times[env] = self._intervals[env] = np.nan
+    def forget(self, envs: NDArray[np.integer[Any]]) -> None:
+        """Know no earlier frame of the ``envs`` (N,)."""
+        self._times[envs] = self._intervals[envs] = np.nan

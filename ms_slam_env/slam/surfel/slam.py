@@ -96,16 +96,23 @@ class BatchedSurfelSlam(Saved):
     def reset(self, T_world_camera: ArrayLike | None = None, env: int = 0) -> None:
         """Forget one env; its next frame is taken at ``T_world_camera`` (identity if None)."""
         pose = np.eye(4) if T_world_camera is None else T_world_camera
-        self._states.reset(env, check_pose(pose, "T_world_camera"))
-        self._last_frames.forget(env)
-        self._shutter.forget(env)
-        self._forget_map(env)
+        self.reset_many(check_pose(pose, "T_world_camera")[None], np.array([env]))
 
-    def _forget_map(self, env: int) -> None:
-        self.map.clear(env)
-        self.relocalization.clear(env)
-        self.loops.reset(env)
-        self.motion_mask.forget(env)
+    def reset_many(self, T_world_camera: Float64, envs: NDArray[np.integer[Any]]) -> None:
+        """Forget the ``envs`` (N,); their next frames are taken at ``T_world_camera`` (N, 4, 4)."""
+        poses = check_poses(T_world_camera, len(envs))
+        self._states.reset(envs, poses)
+        self._shutter.forget(envs)
+        for env in envs.tolist():
+            self._last_frames.forget(env)
+        self._forget_maps(envs)
+
+    def _forget_maps(self, envs: NDArray[np.integer[Any]]) -> None:
+        self.map.clear(envs)
+        for env in envs.tolist():
+            self.relocalization.clear(env)
+            self.loops.reset(env)
+            self.motion_mask.forget(env)
         self.aligner.forget_view()
 
     def track(
@@ -207,8 +214,7 @@ class BatchedSurfelSlam(Saved):
         if where.any():
             frames = self._shutter.level(self._last_frames.images, motions)
             live = self.preprocess(frames.color, frames.depth)
-            for env in np.flatnonzero(where):
-                self._forget_map(int(env))
+            self._forget_maps(np.flatnonzero(where))
             self._states.count(-1)
             self._fuse(live, frames, where)
 

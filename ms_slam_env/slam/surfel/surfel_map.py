@@ -244,6 +244,16 @@ def put_back(
             blocks.bounded[b] = 0
 
 
+@wp.kernel
+def forget_surfels(envs: wp.array[wp.int32], surfels: Surfels, blocks: CullingBlocks) -> None:
+    """Empty the maps of some envs: what lies in the slots is never looked at."""
+    b = envs[wp.tid()]
+    surfels.count[b] = 0
+    surfels.dead[b] = 0
+    surfels.dropped[b] = 0
+    blocks.bounded[b] = 0
+
+
 class MapKernels:
     """Recorded launches for frames of one size under one configuration.
 
@@ -424,14 +434,12 @@ class SurfelMap(Stateful):
         """Renders every ``stride``-th row and column of what was last seen within ``window``."""
         return self.kernels.model_renderer(stride, window)
 
-    def clear(self, env: int | None = None) -> None:
-        """Forget the map of one env, or of all."""
-        counters = [getattr(self.surfels, name) for name in COUNTERS]
-        for counter in (*counters, self._buffers.blocks.bounded):
-            if env is None:
-                counter.zero_()
-            else:
-                counter[env : env + 1].zero_()
+    def clear(self, envs: ArrayLike | None = None) -> None:
+        """Forget the map of one env or of several (N,), or all."""
+        which = np.arange(self.batch) if envs is None else np.atleast_1d(envs)
+        cleared = wp.array(which.astype(np.int32), dtype=wp.int32, device=self.device)
+        inputs = [cleared, self.surfels, self._buffers.blocks]
+        wp.launch(forget_surfels, len(which), inputs, device=self.device)
 
     def fuse(
         self, live: LiveFrame, poses: wp.array, time: wp.array, weight: wp.array, mask: wp.array

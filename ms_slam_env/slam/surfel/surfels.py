@@ -148,16 +148,35 @@ class MapBuffers:
         self.workers = default_workers(batch, device) if workers is None else workers
         of_surfels = batch, capacity, device
         self.surfels: Surfels = allocate(Surfels, *of_surfels)
-        self.spare: Surfels = allocate(Surfels, *of_surfels)  # room for compaction
         self.blocks: CullingBlocks = allocate(
             CullingBlocks, batch, -(-capacity // BLOCK_SIZE), device
         )
         self.visible: VisibleList = allocate(VisibleList, *of_surfels)  # working list
         self.footprints: SplatFootprints = allocate(SplatFootprints, *of_surfels)  # of such a list
-        self.compaction: Compaction = allocate(Compaction, *of_surfels)
+        self._make_compaction()
         self.ages: SurfelAges = allocate(SurfelAges, batch, NUM_AGES, device)
         # What frames are tracked against and fused into: all, unless its times are set.
         self.active = any_time(batch, device)
+
+    def _make_compaction(self) -> None:
+        """Let compaction use the memory of what is listed and drawn, which is made anew later."""
+        batch, capacity, device = self.batch, self.capacity, self.device
+        listed, drawn, size = self.visible, self.footprints, batch * capacity
+        # Three numbers a footprint side by side make room for three colour values a surfel.
+        room = self._room = roomy_zeros(3 * size, wp.float32, device)
+        for number, name in enumerate(("v", "inverse", "slope_u")):
+            part = room[number * size : (number + 1) * size]
+            setattr(drawn, name, part.reshape((batch, capacity)))
+        self.spare = spare = Surfels()
+        spare.position, spare.normal, spare.radius = listed.position, listed.normal, listed.radius
+        spare.color = wp.array(ptr=room.ptr, dtype=wp.vec3, shape=(batch, capacity), device=device)
+        spare.confidence, spare.created, spare.seen = drawn.u, listed.index, drawn.left
+        for name in COUNTERS:
+            setattr(spare, name, wp.zeros(batch, dtype=wp.int32, device=device))
+        self.compaction = Compaction()
+        self.compaction.survivors = drawn.right
+        self.compaction.kept = wp.zeros(batch, dtype=wp.int32, device=device)
+        self.compaction.expired = wp.zeros(batch, dtype=wp.int32, device=device)
 
 
 def default_workers(batch: int, device: str) -> int:

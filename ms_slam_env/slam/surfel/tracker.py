@@ -267,12 +267,12 @@ class Tracker:
         self._model = Pyramid(batch, shapes, False, device)
         self.gauss_newton = GaussNewton(config, cameras, self._model_shapes, device)
         passes = [(level, self._stride(level)) for level in range(num_levels)]
-        slots = self.gauss_newton.slots([*passes, (num_levels - 1, self._search_stride())])
+        searched = self.gauss_newton.slots([(num_levels - 1, self._search_stride())])
 
         # The last of the first is the guess.
-        self._first = HypothesisBuffers(batch, NUM_FIRST + 1, slots, device)
-        self._more = HypothesisBuffers(batch, num_hypotheses - NUM_FIRST, slots, device)
-        self._one = HypothesisBuffers(batch, 1, slots, device)
+        self._first = HypothesisBuffers(batch, NUM_FIRST + 1, searched, device)
+        self._more = HypothesisBuffers(batch, num_hypotheses - NUM_FIRST, searched, device)
+        self._one = HypothesisBuffers(batch, 1, self.gauss_newton.slots(passes), device)
         self._launches = KernelLaunchCache(device)
         self.good_score = GOOD_SCORE
         self._thresholds = SavedBuffer(batch, DeviceThresholds, device)

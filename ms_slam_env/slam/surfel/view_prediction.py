@@ -19,6 +19,7 @@ from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert
+from ms_slam_env.slam.surfel.device import threads_per_row
 from ms_slam_env.slam.surfel.rendering import (
     ModelView,
     SplatParameters,
@@ -28,7 +29,6 @@ from ms_slam_env.slam.surfel.rendering import (
 from ms_slam_env.slam.surfel.surfels import (
     MapBuffers,
     SplatCamera,
-    VisibleList,
     allocate,
     rotation_of,
     translation_of,
@@ -163,6 +163,7 @@ def resolve_views(
     motions: wp.array[wp.mat44],
     camera: SplatCamera,
     keys: wp.array[wp.int64],
+    columns: int,  # per thread
     intensity: wp.array[wp.float32],
     depth: wp.array[wp.float32],
     normals: wp.array[wp.vec3],
@@ -171,7 +172,7 @@ def resolve_views(
 
     The depth at a pixel is that of the winner's plane, within a tenth of the winner's own depth.
     """
-    view, v = wp.tid()
+    view, v, piece = wp.tid()
     e = view / views_per_env
     R = rotation_of(motions[view])
     t = translation_of(motions[view])
@@ -187,7 +188,7 @@ def resolve_views(
         -camera.centre[0] / camera.focal[0], (float(v) - camera.centre[1]) / camera.focal[1], 1.0
     )
     forward = wp.vec3(R[2, 0], R[2, 1], R[2, 2])
-    for u in range(width):
+    for u in range(piece * columns, wp.min((piece + 1) * columns, width)):
         key = keys[row + u]
         if key == EMPTY:
             key = gap_key(keys, image, v, u, height, width)
@@ -279,9 +280,8 @@ def wide_intrinsics(intrinsics: Intrinsics, motions: Float64) -> Intrinsics | No
 class _Reference:
     """Two rendered layers of E maps at one image size, and the points in them."""
 
-    def __init__(self, renderer: SplatRenderer, hidden: VisibleList) -> None:
+    def __init__(self, renderer: SplatRenderer) -> None:
         self.renderer = renderer
-        self.hidden = hidden
         envs, capacity = renderer.envs, 2 * renderer.intrinsics.width * renderer.intrinsics.height
         device = renderer.device
         self.points = allocate(PointCloud, envs, capacity, device)
@@ -292,8 +292,7 @@ class _Reference:
         self.renderer.cull(poses, first_env)
         self._collect(self.renderer.splat(first_env))
         wp.copy(self.points.front_count, self.points.count)
-        self.renderer.list_hidden(self.hidden)
-        self._collect(self.renderer.splat(first_env, self.hidden))
+        self._collect(self.renderer.splat_hidden(first_env))
 
     def _collect(self, layer: ModelView) -> None:
         inputs = [layer.vertices, layer.normals, layer.intensity, self.points]
@@ -312,7 +311,6 @@ class ViewPredictor:
         self.device = buffers.device
         self.workers = buffers.workers
         self._map = buffers
-        self._hidden = allocate(VisibleList, buffers.batch, buffers.capacity, self.device)
         self._references: dict[tuple[int, Intrinsics], _Reference] = {}
         self._single: dict[tuple[int, Intrinsics], SplatRenderer] = {}
         self._outputs: dict[tuple[int, Intrinsics], tuple[wp.array, DeviceViews]] = {}
@@ -350,8 +348,9 @@ class ViewPredictor:
         dim, inputs = (total, self.workers), [*shared, self.workers, keys]
         wp.launch(scatter_points, dim, inputs, device=self.device)
         images = [image.flatten() for image in (views.intensity, views.depth, views.normals)]
-        dim, inputs = (total, views.intrinsics.height), [*shared, keys, *images]
-        wp.launch(resolve_views, dim, inputs, device=self.device)
+        columns, threads = threads_per_row(views.intrinsics.width, self.device)
+        pieces = (total, views.intrinsics.height, threads)
+        wp.launch(resolve_views, pieces, [*shared, keys, columns, *images], device=self.device)
 
     def _predict_singly(self, poses: Float64, views: DeviceViews, first_env: int) -> None:
         """Splat the surfels themselves into every view, one view per env at a time.
@@ -383,7 +382,7 @@ class ViewPredictor:
     def _reference(self, envs: int, intrinsics: Intrinsics) -> _Reference:
         key = (envs, intrinsics)
         if key not in self._references:
-            self._references[key] = _Reference(self._renderer(envs, intrinsics), self._hidden)
+            self._references[key] = _Reference(self._renderer(envs, intrinsics))
         return self._references[key]
 
     def _buffers(self, count: int, intrinsics: Intrinsics) -> tuple[wp.array, DeviceViews]:
