@@ -226,7 +226,7 @@ def fit_of_noise(batch: int) -> NDArray[Any]:
 
 
 def follow_usual(usual: np.void, statistics: np.void, surprise: float) -> None:
-    """Update the running statistics in place with an accepted frame."""
+    """Learn, in place, from a frame that was accepted."""
     found = {name: float(statistics[name]) for name in ("cost", *_RATIOS)}
     for name, value in (found | {"surprise": surprise}).items():
         usual[name] += _FOLLOWS * (value - usual[name])

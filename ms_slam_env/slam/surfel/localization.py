@@ -109,7 +109,7 @@ class CameraStates(Stateful):
         self._own["poses"][env] = pose
 
     def start(self, env: int) -> None:
-        """Record that an env has its first frame."""
+        """Take note that an env has a first frame."""
         self._own["started"][env] = True
 
     def accept(self, env: int, alignment: Alignment, least_scale: float) -> None:

@@ -67,18 +67,18 @@ def geometry_only(photometry: NDArray[Any]) -> NDArray[Any]:
 def next_photometry(
     before: np.void, frame: np.void, conflict: float, least_scale: float
 ) -> np.void:
-    """Photometry of an env after a frame whose tracking began at ``before`` and ended at ``frame``.
+    """Photometry of an env after a frame was tracked with ``before`` and ended as ``frame``.
 
-    ``conflict`` is chi squared between the poses that depth and grey values favour. It is large in
-    frame after frame of a recording whose colour and depth are not registered. Trust in grey values
-    then falls until the two agree within the remaining certainty of the photometric term.
+    ``conflict`` is chi squared between the poses that depth and grey values ask for. A recording
+    whose colour and depth are not registered has much of it, again and again; its grey values are
+    trusted less until the two agree within what is left of the photometric term's certainty.
     """
     after = frame.copy()
     share = max(1.0, USUAL_SCALE * float(frame["scale"]) / least_scale)
     usual = float(before["reference"])
     after["reference"] = share if share > usual else usual + SCALE_FALLS * (share - usual)
     trust = float(before["trust"])
-    if frame["trust"] > 0.0:  # else grey values were not used, and nothing was learnt about them
+    if frame["trust"] > 0.0:  # else grey values had no say, and nothing was learnt about them
         falls = max(TRUST_FALLS, LARGEST_CONFLICT / max(conflict, LARGEST_CONFLICT))
         trust *= falls if conflict > LARGEST_CONFLICT else TRUST_GROWS
     after["trust"] = min(1.0, max(LEAST_TRUST, trust))

@@ -37,7 +37,7 @@ _TURNS = np.stack(
 def tracking_hypotheses(last_motion: Float64) -> Float64:
     """Starts T_model_live (NUM_HYPOTHESES, 4, 4): at rest, at constant velocity, turned six ways.
 
-    A turn also covers a sideways step, because both shift the image.
+    A turn stands for a sideways step too: both shift the image.
     """
     return np.concatenate([np.eye(4)[None], last_motion[None], _TURNS])
 

@@ -194,12 +194,12 @@ class BatchedSurfelSlam(Saved):
             self._fuse(live, frames, where)
 
     def _follow(self, env: int, live: LiveFrame, alignment: Alignment) -> TrackResult:
-        """Pose of a live frame: the given one for the first, tracked or searched for later ones."""
+        """Pose of a live frame: given for the first, tracked or searched for the others."""
         started = self._states.started[env]
         return self._move_on(env, alignment) if started else self._start(env, live)
 
     def _start(self, env: int, live: LiveFrame) -> TrackResult:
-        """Accept the first frame at the given pose, if it shows anything to map."""
+        """Take the first frame at the given pose, if there is something in it to map."""
         pose = self.poses[env].copy()
         if _readings(env, live) < FEWEST_READINGS:
             reason = "the first frame has too few depth readings"
