@@ -211,17 +211,17 @@ _STRICT = {
 
 
 USUAL = np.dtype([(name, np.float64) for name in ("cost", *_RATIOS, "surprise")])
-"""Running statistics of the alignments accepted recently, which show the recording's noise.
+"""What alignments are like that were accepted of late: of a recording's own noise.
 
 ``surprise`` is the difference between motion and expected motion: the larger of metres and radians.
 """
-_FOLLOWS = 0.1  # weight of the last frame in the running statistics
+_FOLLOWS = 0.1  # share of the way from what is usual to the last frame
 _EXPECTED = {"cost": 1.05, "inlier_ratio": 0.9, "photometric_inlier_ratio": 0.85}
-_LARGEST_COST, _SMALLEST_RATIO = 1.9, 0.5  # limits of what noise can make acceptable
+_LARGEST_COST, _SMALLEST_RATIO = 1.9, 0.5  # that noise makes acceptable
 
 
 def fit_of_noise(batch: int) -> NDArray[Any]:
-    """Running statistics (B,) to start from: those of the noise that ``SurfelConfig`` expects."""
+    """What is usual (B,) with the noise that ``SurfelConfig`` expects."""
     return np.full(batch, 1.0).astype(USUAL)
 
 

@@ -348,28 +348,28 @@ class MotionMask(Saved):
         return None
 
     def still(self, depth: Float32) -> Float32:
-        """Depth images (B, H, W) without the readings of moving things."""
+        """Depth images (B, H, W) without the readings of what moves."""
         return depth
 
 
-INTERVAL = 4  # every n-th frame is remembered
-NEW = 3  # remembered frames that are still recent: slow things have hardly moved since
-COLUMNS = 80  # approximate number of columns of the grid
-SIGMAS = 3.0  # tolerance in standard deviations of the depth noise
-STEP_PER_M = 0.016  # step of inverse depth, per column of a 160-column image, that cuts segments
-COS_CREASE = 0.8  # cosine of the angle between neighbouring normals that cuts segments
-FEWEST = 12  # pixels of the grid needed to prove that a segment moves
-SHARE_APPEARED, SHARE_VANISHED = 0.3, 0.6  # least share of a segment's pixels
-NEIGHBOURS = 0.3  # share of the surrounding pixels that must have appeared, too
-FIRST = NEW * INTERVAL + 1  # first frames, for which there are no old ones
+INTERVAL = 4  # frames between two that are remembered
+NEW = 3  # of the earlier frames; slow things have hardly moved since
+COLUMNS = 80  # of the grid of pixels that are looked at, about
+SIGMAS = 3.0  # of the depth noise
+STEP_PER_M = 0.016  # of inverse depth per column of a 160-column image: there pieces are cut
+COS_CREASE = 0.8  # of the angle between neighbouring normals, likewise
+FEWEST = 12  # pixels of the grid that prove a piece to be moving
+SHARE_APPEARED, SHARE_VANISHED = 0.3, 0.6  # of a piece's pixels for and against
+NEIGHBOURS = 0.3  # share of the pixels around that must have appeared too
+FIRST = NEW * INTERVAL + 1  # frames that have no old ones
 NEAR = 0.8  # of the median depth
-NEAREST = 0.3  # metres; nearer readings get no larger weight
-WEIGHT_NEW = 0.2  # share of the alignment's weight from which new surface can lead a pose astray
-SHARE_NEW = 0.7  # share of unsupported pixels that makes a segment new
-SHARE_KNOWN = 0.1  # share of a segment's pixels that an earlier frame must have seen
-FOR, AGAINST, FORGETTING = 2.0, 0.7, 0.15  # change in log-odds per observation
-MOST, LEAST = 4.0, -2.0  # limits of the log-odds
-CONFIRMED = 1.2  # log-odds of a surface that drew a pose along; fades soon unless seen to move
+NEAREST = 0.3  # metres; what is nearer weighs no more
+WEIGHT_NEW = 0.2  # of what is new that can lead a pose astray, share of all
+SHARE_NEW = 0.7  # of the pixels of a piece that is taken for new
+SHARE_KNOWN = 0.1  # of its pixels that an earlier frame saw
+FOR, AGAINST, FORGETTING = 2.0, 0.7, 0.15  # log-odds of an observation
+MOST, LEAST = 4.0, -2.0  # log-odds at which they end
+CONFIRMED = 1.2  # log-odds of what has drawn a pose along: seen to move or forgotten soon
 MASKED = 0.5  # log-odds above which a pixel is masked
 CHANGED = 0.01  # share of newly masked pixels that makes an alignment worth repeating
 _RIM = np.ones((3, 3), dtype=np.uint8)
@@ -422,9 +422,9 @@ class GeometricMotionMask(MotionMask):
         self._live_odds = np.zeros((batch, *shape), dtype=np.float32)
         self._live_pose = self._pose_before
         self._weight_of_new = np.zeros(batch)
-        self._new = np.zeros((batch, *shape), dtype=bool)  # found by the last strict look
-        self._moved: Bool = np.zeros(batch, dtype=bool)  # whether anything moved in the last frames
-        self._moves_now: Bool = np.zeros(batch, dtype=bool)  # whether it does in the live ones
+        self._new = np.zeros((batch, *shape), dtype=bool)  # what the last strict look found
+        self._moved: Bool = np.zeros(batch, dtype=bool)  # whether anything did in the last frames
+        self._moves_now: Bool = np.zeros(batch, dtype=bool)  # and does in the live ones
         self._is_marked = True  # whether ``LiveFrame.moving`` may hold a mask
         self._seen: LiveFrame | None = None  # the frame whose launches are recorded
         self._looked: Float64 | None = None  # inputs from which the present mask was found
@@ -515,14 +515,14 @@ class GeometricMotionMask(MotionMask):
         return np.asarray((self._alert > 0) | is_due)
 
     def _weight_unseen(self, env: int, is_still: Bool) -> float:
-        """Share of unmasked readings that are not ``is_still`` (h, w), by weight in alignment."""
+        """Share of the unmasked readings that are not ``is_still`` (h, w), as alignments weigh."""
         depth = self._depth.read()[env]
         counts = (depth > 0) & (self._masked.read()[env] == 0)
         weights = np.maximum(depth[counts], NEAREST) ** -4.0
         return float(weights[~is_still[counts]].sum() / max(weights.sum(), 1e-6))
 
     def _is_near(self, env: int) -> Bool:
-        """Pixels (h, w) clearly nearer than the median depth, with a rim."""
+        """Where (h, w) something is clearly nearer than half of the image, with a rim."""
         depth = self._depth.read()[env]
         if not depth.any():
             return depth > 0
@@ -583,7 +583,7 @@ class GeometricMotionMask(MotionMask):
         return np.where(slots < stored, np.where(back < NEW, RECENT, OLD), UNUSED)
 
     def _mask_by(self, odds: Float32, T_world_live: Float64) -> None:
-        """Mask the live frames at poses (B, 4, 4) by log-odds (B, h, w), plus a one-pixel rim."""
+        """Mask the live frames at poses (B, 4, 4) by log-odds (B, h, w), with a rim of a pixel."""
         self._live_odds, self._live_pose = odds, T_world_live
         is_masked = odds > MASKED
         self._moves_now = np.asarray(is_masked.any(axis=(1, 2)))
@@ -615,7 +615,7 @@ class GeometricMotionMask(MotionMask):
             slots = self._count // INTERVAL % PAST
             self._past_poses[due, slots[due]] = T_world_live[due]
             depth = self._depth.read()
-            depth[self._masked.read() > 0] *= -1.0  # negative: moving
+            depth[self._masked.read() > 0] *= -1.0  # of what moves
             _store(self._past_depth, due, slots, depth)
             _store(self._past_nearest, due, slots, self._nearest.read())
         self._pose_before[good] = T_world_live[good]
@@ -653,7 +653,7 @@ def _flat(*buffers: SavedBuffer) -> list[wp.array]:
 
 
 def _store(past: SavedBuffer, due: Bool, slots: NDArray[Any], live: Float32) -> None:
-    """Store the images of the envs that are due in their slots."""
+    """Put the images of the envs that are due into their slots."""
     images = past.read()
     images[due, slots[due]] = live[due]
     past.write(images)

@@ -178,7 +178,7 @@ class InvalidFrameDetector(Saved):
         self.colorless = np.zeros(batch, dtype=bool)
 
     def find(self, color: NDArray[np.uint8], started: Bool) -> Bool:
-        """Which frames (B, H, W, 3) are blank; the first of an env shows whether it has colour."""
+        """Which frames (B, H, W, 3) are blank; the first of an env says whether it has colour."""
         blank = is_invalid_frame(color)
         self.colorless = np.where(started, self.colorless, blank)
         return blank & ~self.colorless

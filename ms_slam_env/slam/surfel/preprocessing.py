@@ -309,7 +309,7 @@ class Preprocessor:
 def check_images(
     color: NDArray[np.uint8], depth: NDArray[np.float32], size: tuple[int, ...]
 ) -> None:
-    """Refuse images that are not of ``size`` (B, H, W), and invalid depth values."""
+    """Refuse another ``size`` than (B, H, W), and depth that is no depth."""
     if color.shape != (*size, 3) or depth.shape != size:
         raise InputError(
             f"colour {color.shape} and depth {depth.shape} must be {(*size, 3)} and {size}"

@@ -65,8 +65,8 @@ def project_footprints(
 ) -> None:
     """Compute the footprints of the listed surfels.
 
-    The compiler vectorizes several short loops without branches, but not one loop that writes many
-    arrays.
+    Several short loops without branches: the compiler turns them into operations on many surfels
+    at once, which it does not for loops that write many arrays.
     """
     k, worker = wp.tid()
     fx = camera.focal[0]
@@ -143,7 +143,7 @@ def splat_depth(
     footprints: SplatFootprints,
     z_buffer: wp.array[wp.float32],
 ) -> None:
-    """Write inverse depth (E * H * W) of the nearest disc per pixel; list discs that hit one."""
+    """Inverse depth (E * H * W) of the nearest disc at every pixel; list the discs on a pixel."""
     k, worker = wp.tid()
     width = camera.width
     image = k * camera.height * width
@@ -283,7 +283,7 @@ def resolve_row(
     intensity: wp.array[wp.float32],
     color: wp.array[wp.vec3],
 ) -> None:
-    """Resolve the row of pixels that starts at ``first``; its rays have ``y`` at z = 1."""
+    """Resolve the row of pixels from ``first`` on, on which the rays have ``y`` at z = 1."""
 
 
 @wp.kernel
@@ -405,7 +405,7 @@ class SplatRenderer:
         return self.view
 
     def _record_splats(self, listed: VisibleList, first_env: int) -> list[RecordedLaunch]:
-        """Record the three passes over the surfels of a list."""
+        """The three passes over the surfels of a list."""
         surfels, workers = self._buffers.surfels, self._buffers.workers
         shared = [listed, self.camera, workers, self._buffers.footprints]
         listed_in = [surfels, listed, first_env, *shared[1:]]

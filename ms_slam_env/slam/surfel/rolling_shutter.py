@@ -92,7 +92,7 @@ class _Leveller:
         self._launch = RecordedLaunch(_level, dim, [rows, *levelled], device)
 
     def __call__(self, frames: Images, twists: Float64) -> Images:
-        """Level frames during whose readout the cameras moved by ``twists`` (B, 6)."""
+        """Level frames that were read while the cameras moved by ``twists`` (B, 6)."""
         check_images(frames.color, frames.depth, self._depth.array.shape)
         self._color.write(frames.color)
         self._depth.write(frames.depth)
@@ -137,5 +137,5 @@ class Shutter(Saved):
         return self._leveller(taken, share[:, None] * np.stack([se3_log(T) for T in motions]))
 
     def forget(self, env: int) -> None:
-        """Forget the earlier frames of an env."""
+        """Know no earlier frame of an env."""
         self._times[env] = self._intervals[env] = np.nan

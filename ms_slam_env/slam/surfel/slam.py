@@ -292,7 +292,7 @@ class BatchedSurfelSlam(Saved):
     def restart(self, T_world_camera: Float64, env: int = 0) -> None:
         """Forget an env's map and last frame; track that frame again to start a new map.
 
-        Keeps what is known of the recording's noise.
+        What the recording's noise is stays known.
         """
         frame, noise = self.last_frame(env), self.noise(env)
         self.reset(T_world_camera, env)

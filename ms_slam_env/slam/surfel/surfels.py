@@ -153,7 +153,7 @@ class MapBuffers:
             CullingBlocks, batch, -(-capacity // BLOCK_SIZE), device
         )
         self.visible: VisibleList = allocate(VisibleList, *of_surfels)  # working list
-        self.footprints: SplatFootprints = allocate(SplatFootprints, *of_surfels)  # of that list
+        self.footprints: SplatFootprints = allocate(SplatFootprints, *of_surfels)  # of such a list
         self.compaction: Compaction = allocate(Compaction, *of_surfels)
         self.ages: SurfelAges = allocate(SurfelAges, batch, NUM_AGES, device)
         # Surfels that frames are tracked against and fused into: all, unless its times are set.
