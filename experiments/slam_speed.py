@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from ms_slam_experiments.shared import slam_speed_child
 
-from ms_slam_env import scenes, sequences
+from ms_slam_env import scenes, sequences, slam
 from ms_slam_env._runtime.parallel import thread_environment
 from ms_slam_env.benchmark.experiment import Experiment, check_names
 from ms_slam_env.camera import xtion
-from ms_slam_env.config import Checked, bounded, check_range
+from ms_slam_env.config import Checked, bounded, check_range, parse_named
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
@@ -74,7 +74,7 @@ class SlamSpeed(Experiment, Checked):
     against: Path | None = None
     """Checkout with another version of the package, which runs alternately with this one."""
     backend: tuple[str, ...] = ()
-    """Parameters of SLAM that differ from the default, ``name=value`` each (JSON values)."""
+    """Parameters of SLAM that differ from the default, ``name=value`` each."""
 
     unit = "measurements"
     workers = 1
@@ -197,20 +197,13 @@ def _pixels(size: str) -> int:
 
 
 def backend_parameters(words: tuple[str, ...]) -> dict[str, Any]:
-    """Parameters from ``name=value`` words.
+    """Parameters of the surfel SLAM from ``name=value`` words, as ``parse_named`` reads them.
 
     Raises:
-        InputError: a malformed word, or a value that is not JSON.
+        InputError: a malformed word, an unknown parameter, or a value that is out of range.
     """
-    parameters = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        try:
-            parameters[name] = json.loads(value)
-        except json.JSONDecodeError:
-            equals = ""
-        if not equals:
-            raise InputError(f"a parameter is given as name=value, such as coverage_px=0.9: {word}")
+    name, parameters = parse_named(",".join(("surfel", *words)), "backend")
+    slam.check_parameters(name, parameters)
     return parameters
 
 

@@ -185,6 +185,23 @@ def test_ci_runs_the_tests() -> None:
     assert re.search(r"^exec make .*test$", script.read_text(), re.MULTILINE)
 
 
+def test_the_first_run_says_that_it_compiles(tmp_path: Path) -> None:
+    def said() -> str:
+        done = subprocess.run(
+            [sys.executable, "-c", "import ms_slam_env._runtime.warp"],
+            env={**os.environ, "WARP_CACHE_PATH": str(tmp_path / "kernels")},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return done.stderr
+
+    assert said() == "ms_slam_env compiles its kernels once, which takes a minute or two\n"
+    (of_this_warp,) = (tmp_path / "kernels").iterdir()
+    (of_this_warp / "wp_a_kernel").mkdir()
+    assert said() == ""
+
+
 def test_kernels_need_no_place_to_be_kept() -> None:
     """As in a home that cannot be written."""
     code = "from ms_slam_env._runtime.warp import wp; print(wp.config.kernel_cache_dir)"

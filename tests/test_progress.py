@@ -34,7 +34,7 @@ def test_a_log_gets_a_line_every_half_minute_and_one_at_the_end(clock, capsys) -
     text = capsys.readouterr().err
     assert "\r" not in text
     lines = text.splitlines()
-    assert [line.split(" [")[0] for line in lines] == [
+    assert [line.split(",")[0] for line in lines] == [
         "frames: 240 of 1000",
         "frames: 480 of 1000",
         "said on the way",
@@ -50,7 +50,7 @@ def test_a_bar_without_a_total_and_one_that_is_disabled(capsys) -> None:
     for _ in Bar(iter(range(3)), "steps"):
         pass
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("steps: 3 of ? [")
+    assert line.startswith("steps: 3 of ?, ")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a terminal")

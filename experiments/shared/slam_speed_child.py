@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ms_slam_env.camera import xtion
+from ms_slam_env.config import from_dict
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 
 STAGES = {
@@ -97,7 +98,7 @@ def measure(
         color, depth, poses = data["color"], data["depth"], data["poses"]
     # With spare capacity, since a full map spends time on making room.
     capacity = max(400_000, max(stored) * 5 // 4 + 8 * depth[0].size)
-    config = SurfelConfig(**{"max_surfels": capacity, **backend})
+    config = from_dict(SurfelConfig, {"max_surfels": capacity, **backend}, "backend")
     slam = BatchedSurfelSlam(1, xtion(size), config)
     slam.reset(poses[0])
     for image, distance in zip(color[:warm_up], depth[:warm_up], strict=True):

@@ -26,7 +26,7 @@ class Bar(tqdm):
         if not self._in_terminal:
             options = {"mininterval": EVERY_S, "maxinterval": EVERY_S, **options}
             options["bar_format"] = (
-                "{desc}: {n_fmt} of {total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
+                "{desc}: {n_fmt} of {total_fmt}, {elapsed} elapsed, {remaining} left{postfix}"
             )
         super().__init__(*args, **options)
 

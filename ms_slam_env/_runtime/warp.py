@@ -5,8 +5,10 @@ import ctypes
 import errno
 import math
 import mmap
+import multiprocessing
 import os
 import shutil
+import sys
 import tempfile
 import warnings
 from collections.abc import Sequence
@@ -76,6 +78,8 @@ if _refused is not None:
         InputWarning,
         stacklevel=2,
     )
+elif multiprocessing.parent_process() is None and not os.listdir(wp.config.kernel_cache_dir):
+    print("ms_slam_env compiles its kernels once, which takes a minute or two", file=sys.stderr)
 
 
 def roomy_zeros(shape: int | tuple[int, ...], dtype: Any, device: str) -> Any:

@@ -97,7 +97,8 @@ def compare(before: Any, after: Any, where: str = "") -> list[str]:
 
 
 def _alike(old: Any, new: Any) -> bool:
-    if isinstance(old, float) and isinstance(new, (int, float)):
+    is_number = not isinstance(old, bool) and isinstance(old, (int, float))
+    if is_number and not isinstance(new, bool) and isinstance(new, (int, float)):
         return math.isclose(old, new, rel_tol=TOLERANCE, abs_tol=_SMALLEST)
     return bool(old == new)
 

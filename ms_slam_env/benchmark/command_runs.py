@@ -70,7 +70,8 @@ def check_command(backend: str) -> list[str]:
     """Split ``[NAME=]command:PROGRAM ... {sequence} ... {trajectory}`` into words.
 
     Raises:
-        InputError: no such program, a missing placeholder, or an unclosed quote.
+        InputError: no such program, a missing placeholder, an unclosed quote, or a file named by a
+            relative path, since the program runs in another folder.
     """
     text = command_of(backend).removeprefix(PREFIX)
     try:
@@ -85,6 +86,11 @@ def check_command(backend: str) -> list[str]:
             )
     if shutil.which(words[0]) is None:
         raise InputError(f"command {text!r}: there is no program {words[0]!r}")
+    for word in words:
+        if is_named(Path(word)) and not Path(word).is_absolute():
+            raise InputError(
+                f"command {text!r} runs in a temporary folder: give {word!r} as an absolute path"
+            )
     return words
 
 

@@ -114,7 +114,10 @@ def run_all(
 
             variables = one_thread_unless_set() if environment is None else environment
             pool = open_pool(run, workers, ray, environment=variables, fresh=fresh)
-            with kept(f"finished {description} are kept in {out}; the same command goes on"), pool:
+            with (
+                kept(f"finished {description} are kept in {out}; the same command continues"),
+                pool,
+            ):
                 for outcome in run_each(pool, todo):
                     finish(_row(outcome, todo[outcome.key]))
     return [rows[key] for key in dict.fromkeys(keys)]

@@ -23,14 +23,14 @@ from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env.errors import InputError, unknown
 
 RESULTS_VERSIONS = {
-    1: "before results had a version: by algorithms and measures that have changed since",
-    2: "the algorithms of release 0.1, maps judged against surface as far away as SLAM looks",
-    3: "near planes keep their normals, far depth is weighted, doubtful frames are asked twice",
-    4: "normals are weighed exactly, frames beyond doubt are asked once, planners draw from seeds "
-    "of their own",
-    5: "environments have M_I = 0.15 and M_D = 0.36, and align anew what may have slipped",
-    6: "SLAM judges alignments by the noise of the recording, asks features where they fit badly, "
-    "and masks what moves and goes on in submaps by default",
+    1: "results without a recorded version, by algorithms and measures that have changed",
+    2: "algorithms of release 0.1; maps are compared with the true surface in SLAM's depth range",
+    3: "near planes keep their normals, far depth is weighted, doubtful frames are checked twice",
+    4: "normals are weighted exactly, frames beyond doubt are checked once, planners use their own "
+    "random seeds",
+    5: "environments have M_I = 0.15 and M_D = 0.36, and align frames again that may have slipped",
+    6: "SLAM judges alignments by the noise of the recording, uses features for frames that fit "
+    "badly, and by default masks moving things and continues in submaps when lost",
 }
 """Version to a description of its algorithms.
 

@@ -14,6 +14,8 @@ compressed or not. Options:
 - ``rows``: largest number of rows.
 - ``made_by=yes``: add a line with the command.
 
+A long comment may continue on a second line that is indented by four spaces.
+
 If the result is older than the code, or was made with code that is in no commit, a warning stands
 above the first of its tables on the page.
 
@@ -22,6 +24,8 @@ relative to the root of the clone, and their model cards follow.
 
 With ``leaders:``, the comment names folders of results of the planner benchmark and ``by=METRIC``.
 The table says which planner leads each benchmark, and by how much.
+
+With ``versions: results``, the table lists the results versions, to which those warnings link.
 """
 
 from __future__ import annotations
@@ -36,12 +40,14 @@ from pathlib import Path
 from ms_slam_env._runtime.input_files import read_text
 from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.metrics.registry import RESULTS_VERSIONS
 from ms_slam_env.report.leaders import leaders
 from ms_slam_env.report.model_cards import model_cards
 from ms_slam_env.report.results import RESULTS, Results, made_by, read_results
 from ms_slam_env.report.tables import Table
 
-_START = re.compile(r"^<!-- (?P<kind>results|agents|leaders): (?P<what>.*) -->$")
+_START = re.compile(r"^<!-- (?P<kind>results|agents|leaders|versions): (?P<what>.*) -->$")
+_CONTINUED = re.compile(r"^(<!-- \w+: [^\n]*)\n {4}([^\n]* -->)$", re.MULTILINE)
 _END = "<!-- end -->"
 _OPTIONS = ("table", "columns", "where", "rows", "made_by")
 
@@ -88,8 +94,10 @@ def with_tables(text: str, results: Path, name: str = "page", mark: Mark = _unma
     lines: list[str] = []
     warned: set[Path] = set()  # results whose warning is already on the page
     opened = 0  # line number of the comment that opens a table
-    for number, line in enumerate(text.split("\n"), start=1):
-        start = _START.match(line)
+    number = 0
+    for line in _CONTINUED.sub("\\1\0\\2", text).split("\n"):
+        number += 1 + line.count("\0")
+        start = _START.match(line.replace("\0", " "))
         if opened and start:
             raise InputError(f"{name}, line {opened}: no {_END} before line {number}")
         if line == _END and not opened:
@@ -101,8 +109,10 @@ def with_tables(text: str, results: Path, name: str = "page", mark: Mark = _unma
                     inserted = _cards(start["what"], results, Path(name))
                 elif start["kind"] == "leaders":
                     inserted = _leaders(start["what"], results, mark)
+                elif start["kind"] == "versions":
+                    inserted = _versions()
                 else:
-                    inserted = _inserted(start["what"], results, warned, mark)
+                    inserted = _inserted(start["what"], results, Path(name), warned, mark)
                 lines += [line, "", *inserted.split("\n"), ""]
             except InputError as error:
                 raise InputError(f"{name}, line {number}: {error}") from None
@@ -112,7 +122,7 @@ def with_tables(text: str, results: Path, name: str = "page", mark: Mark = _unma
             lines.append(line)
     if opened:
         raise InputError(f"{name}, line {opened}: no {_END}")
-    return "\n".join(lines)
+    return "\n".join(lines).replace("\0", "\n    ")
 
 
 def _cards(what: str, results: Path, page: Path) -> str:
@@ -131,6 +141,13 @@ def _leaders(what: str, folder: Path, mark: Mark) -> str:
     return leaders(found, by[0], mark).as_markdown().rstrip("\n")
 
 
+def _versions() -> str:
+    """Table of the results versions, the newest first."""
+    head = ["| version | what its algorithms do |", "| ---: | --- |"]
+    versions = sorted(RESULTS_VERSIONS.items(), reverse=True)
+    return "\n".join([*head, *(f"| {version} | {text} |" for version, text in versions)])
+
+
 def _words(what: str) -> list[str]:
     try:
         return shlex.split(what)
@@ -138,7 +155,7 @@ def _words(what: str) -> list[str]:
         raise InputError(f"{what!r}: {str(error).lower()}") from None
 
 
-def _inserted(what: str, folder: Path, warned: set[Path], mark: Mark) -> str:
+def _inserted(what: str, folder: Path, page: Path, warned: set[Path], mark: Mark) -> str:
     """Text below a comment: a warning if the result is out of date, then note and table.
 
     Results in ``warned`` already have a warning on the page; a new one is added to it.
@@ -152,7 +169,8 @@ def _inserted(what: str, folder: Path, warned: set[Path], mark: Mark) -> str:
     path = path if path.suffix == ".json" else path / RESULTS
     results = read_results(path)
     table = _cut(mark(_chosen(results, options.get("table", "0"))), options)
-    parts = [f"*{results.caveats}*\n"] if results.caveats and path not in warned else []
+    caveats = results.short_caveats(page, folder.parent)
+    parts = [f"*{caveats}*\n"] if caveats and path not in warned else []
     warned.add(path)
     parts.append(table.as_markdown())
     if options.get("made_by") == "yes":

@@ -111,7 +111,8 @@ def model_cards(paths: Sequence[Path], results: Path, page: Path) -> str:
         InputError: a path that is not a policy file, or a folder without one.
     """
     found, _ = find_results(results)
-    return "\n".join(_card(policy, found, page) for policy in map(read_policy_text, _files(paths)))
+    policies = map(read_policy_text, _files(paths))
+    return "\n".join(_card(policy, found, page, results.parent) for policy in policies)
 
 
 def _files(paths: Sequence[Path]) -> Iterator[Path]:
@@ -127,7 +128,7 @@ def _config(one: FoundResult) -> Mapping[str, Any]:
     return config if isinstance(config, dict) else {}
 
 
-def _card(policy: Policy, found: Sequence[FoundResult], page: Path) -> str:
+def _card(policy: Policy, found: Sequence[FoundResult], page: Path, docs: Path) -> str:
     trainings = [one for one in found if policy.is_trained_in(one)]
     benchmarks = [one for one in found if one.results.kind == "planners" and _scores(one, policy)]
     parts = [f"## `{policy.planner}`\n", _facts(policy), _command(policy.known)]
@@ -137,7 +138,7 @@ def _card(policy: Policy, found: Sequence[FoundResult], page: Path) -> str:
         if known is None or score.weight > known.weight:
             scores[score.task] = score
     for score in scores.values():
-        parts += list(_score_text(score, policy))
+        parts += list(_score_text(score, policy, page, docs))
     if not benchmarks:
         parts.append("It has not been benchmarked yet.\n")
     like = {
@@ -234,11 +235,12 @@ def _scores(one: FoundResult, policy: Policy) -> list[_Score]:
     return scores
 
 
-def _score_text(score: _Score, policy: Policy) -> Iterator[str]:
+def _score_text(score: _Score, policy: Policy, page: Path, docs: Path) -> Iterator[str]:
     others, results = score.others, score.one.results
     yield f"### In `{score.task}`\n"
-    if results.caveats:
-        yield f"*{results.caveats}*\n"
+    caveats = results.short_caveats(page, docs)
+    if caveats:
+        yield f"*{caveats}*\n"
     seeds = _config(score.one).get("seeds", "test")
     if seeds != "test":
         yield f"On {seeds} seeds:\n" if seeds in SEED_SPLITS else f"On the seeds {seeds}:\n"

@@ -156,13 +156,14 @@ def _axis(key: str, categories: list[str]) -> dict[str, Any]:
 def _logarithmic(panel: Panel, axis: str) -> dict[str, Any]:
     """A logarithmic axis with a few plain numbers: decades; 1, 2 and 5 in each; or evenly spread.
 
-    Without a format, Plotly writes 0.05, 0.1, 0.2, 0.5 as 5, 0.1, 2, 5.
+    Without a format, Plotly writes 0.05, 0.1, 0.2, 0.5 as 5, 0.1, 2, 5; ``~g`` writes a million as
+    1e+6 beside 500000.
     """
     values = [value for series in panel.series for value in getattr(series, axis)]
     drawn = [value for value in values if value is not None and 0 < value < math.inf]
     decades = math.log10(max(drawn) / min(drawn)) if drawn else 0.0
     step = {} if decades < 0.8 else {"dtick": "D2" if decades < 3 else 1}
-    return {"type": "log", "tickformat": "~g", **step}
+    return {"type": "log", "tickformat": ",~r", **step}
 
 
 def _guides(panel: Panel) -> list[dict[str, Any]]:

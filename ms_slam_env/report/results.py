@@ -15,6 +15,7 @@ files of the folder are made from it. Every reader accepts both forms.
 from __future__ import annotations
 
 import lzma
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -97,6 +98,15 @@ class Results:
     def caveats(self) -> str:
         """Warnings about old or uncommitted code behind the result; empty if there are none."""
         return " ".join(filter(None, (self.stale, self.uncommitted)))
+
+    def short_caveats(self, page: Path, docs: Path) -> str:
+        """The caveats as Markdown for a page; a link to ``docs`` leads to what has changed."""
+        link = os.path.relpath(docs / "experiments.md", page.parent)
+        stale = (
+            f"Results version {self.version}, older than the code "
+            f"([changes]({link}#results-versions))."
+        )
+        return " ".join(filter(None, (stale if self.stale else "", self.uncommitted)))
 
     def as_markdown(self) -> str:
         """The caveats, the tables, and their provenance, as Markdown."""

@@ -85,7 +85,7 @@ def _write_whole(
     kinds = ("rgb", "depth", *(("depth_true", "labels") if with_truth else ()))
     for kind in (*kinds, "objects") if sequence.frames.object_trajectories else kinds:
         own_folder(partial / kind)
-    with kept(f"finished frames are kept in {partial}; the same command goes on"):
+    with kept(f"finished frames are kept in {partial}; the same command continues"):
         for index, name in enumerate(Bar(names, desc=sequence.name, unit="frame")):
             _write_frame(partial, name, sequence, index, with_truth)
     _write_lists(partial, names, kinds)

@@ -58,7 +58,7 @@ def explore(
         raise InputError(f"{name} = {value} must be at least 1")
     storage = StudyStorage(folder, space, settings)
     report = progress or (lambda finished: None)
-    with kept(f"finished trials are kept in {folder}; the same command goes on"):
+    with kept(f"finished trials are kept in {folder}; the same command continues"):
         if workers == 1 and ray_address is None:
             _explore_here(storage, evaluate, budget, report)
         else:

@@ -155,6 +155,15 @@ def test_a_bad_command_is_refused_before_anything_runs(command, message) -> None
         Compare(backends=(command,))
 
 
+def test_a_script_in_the_current_folder_needs_an_absolute_path(tmp_path, monkeypatch) -> None:
+    (tmp_path / "peer.py").touch()
+    monkeypatch.chdir(tmp_path)
+    command = "command:{} {} {{sequence}} {{trajectory}}"
+    with pytest.raises(InputError, match=r"give 'peer.py' as an absolute path"):
+        Compare(backends=(command.format(sys.executable, "peer.py"),))
+    Compare(backends=(command.format(sys.executable, tmp_path / "peer.py"),))
+
+
 def test_two_commands_of_one_name_are_refused() -> None:
     command = "mine=command:sh {sequence} {trajectory}"
     with pytest.raises(InputError, match="must differ"):

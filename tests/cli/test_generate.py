@@ -96,7 +96,7 @@ def test_an_interrupted_command_goes_on_to_the_same_files(tmp_path, monkeypatch,
         patch.setattr(RenderedFrames, "__getitem__", interrupted)
         assert main(["generate", *options, "--out", str(target)]) == 130
     last = capsys.readouterr().err.strip().splitlines()[-1]
-    assert last.endswith("stopped.partial; the same command goes on")
+    assert last.endswith("stopped.partial; the same command continues")
     assert last.startswith("ms-slam: interrupted; finished frames are kept in ")
     assert not target.exists()
     assert len(list((tmp_path / "stopped.partial").glob("depth/*.png"))) == 2

@@ -16,7 +16,11 @@ TINY = {"scene": "carpet", "seed": 1000, "sizes": ("80x60",), "frames": 5, "warm
 
 
 def test_stages_add_up_and_stored_surfels_are_as_asked():
-    options = {"stored": (30_000,), "repeats": 1, "backend": ("compaction_interval=7",)}
+    options = {
+        "stored": (30_000,),
+        "repeats": 1,
+        "backend": ("compaction_interval=7", "acceptance.cost=1.3"),
+    }
     experiment = SlamSpeed(**TINY, **options, against=Path())
     specs = experiment.specs()
     assert [spec.version for spec in specs] == ["this", "other"]
@@ -98,9 +102,15 @@ def test_the_ratio_is_the_median_over_rounds():
 def test_bad_checkout_and_parameter(tmp_path):
     with pytest.raises(InputError, match="holds no package"):
         SlamSpeed(against=tmp_path)
-    with pytest.raises(InputError, match="name=value"):
+    with pytest.raises(InputError, match="'coverage_px' is not option=value"):
         backend_parameters(("coverage_px",))
-    assert backend_parameters(("iterations=[1, 2]",)) == {"iterations": [1, 2]}
+    with pytest.raises(
+        InputError, match=r"unknown option.*motion_musk'; valid choices: .*motion_mask"
+    ):
+        backend_parameters(("motion_musk=none",))
+    words = ("iterations=[1, 2]", "motion_mask=none", "acceptance.inliers=0.4")
+    parameters = {"iterations": [1, 2], "motion_mask": "none", "acceptance.inliers": 0.4}
+    assert backend_parameters(words) == parameters
 
 
 def test_a_free_camera_is_measured_once_whatever_the_frames():

@@ -11,6 +11,7 @@ import pytest
 
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
+from ms_slam_env.metrics.registry import RESULTS_VERSIONS
 from ms_slam_env.report.markdown_pages import with_tables
 from ms_slam_env.report.results import pack_results, read_results, write_results
 from ms_slam_env.report.tables import make_table
@@ -55,9 +56,31 @@ def test_age_and_command_stand_with_the_table(clone: Path) -> None:
     path = clone / "docs/results/x/results.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"results_version": 1}))
     what = 'x/results.json table="Empty one" made_by=yes'
-    text = with_tables(2 * PAGE.format(what, ""), clone / "docs/results")
-    assert text.count("*These figures are older than the code") == 1  # the first says it
+    for page, link in (
+        ("README.md", "docs/experiments.md"),
+        ("docs/results/a.md", "../experiments.md"),
+    ):
+        text = with_tables(2 * PAGE.format(what, ""), clone / "docs/results", str(clone / page))
+        mark = f"*Results version 1, older than the code ([changes]({link}#results-versions)).*"
+        assert text.count(mark) == 1  # the first says it
     assert "Made by `" in text
+
+
+def test_a_long_comment_may_take_two_lines(clone: Path) -> None:
+    folder = clone / "docs/results"
+    one, two = (PAGE.format(f"x columns=ate_m,planner{gap}rows=2", "") for gap in (" ", "\n    "))
+    head, _, table = with_tables(one, folder).partition("planner rows=2")
+    assert with_tables(two, folder) == f"{head}planner\n    rows=2{table}"
+    with pytest.raises(InputError, match="line 4: unknown table '7'"):
+        with_tables(PAGE.format("x table=7\n    rows=2", ""), folder)
+
+
+def test_the_versions_that_marks_lead_to_are_listed(clone: Path) -> None:
+    page = "<!-- versions: results -->\n<!-- end -->\n"
+    lines = with_tables(page, clone / "docs/results").split("\n")
+    assert [line for line in lines if line[:3] in ("| 1", "| 6")] == [
+        f"| {version} | {RESULTS_VERSIONS[version]} |" for version in (6, 1)
+    ]
 
 
 @pytest.mark.parametrize(

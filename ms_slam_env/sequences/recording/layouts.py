@@ -97,7 +97,7 @@ def _calibration_of(
         return calibration(*known, 640, 480)
     raise InputError(
         f"intrinsics of {folder} are missing: write 'fx fy cx cy width height [depth_scale]' into "
-        f"{folder / 'intrinsics.txt'}, or give them with the command"
+        f"{folder / 'intrinsics.txt'}, or pass the same text as --intrinsics"
     )
 
 

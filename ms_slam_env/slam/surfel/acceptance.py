@@ -1,4 +1,4 @@
-"""What aligning a frame with the map found, and whether that is believed: on the device."""
+"""The result of aligning a frame with the map, and its acceptance test on the device."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def _squared_norm(H: mat66d, g: vec6d) -> wp.float64:
 def _conflict(A: mat66d, B: mat66d, g_a: vec6d, g_b: vec6d) -> wp.float64:
     """Chi squared of the difference between the minima of the geometric and photometric terms.
 
-    min (x - x_a)^T A (x - x_a) + (x - x_b)^T B (x - x_b): what the joint minimum costs more than
-    each term at its own. A prior of 5 cm keeps a term without information at home.
+    min (x - x_a)^T A (x - x_a) + (x - x_b)^T B (x - x_b): the extra cost of the joint minimum over
+    the minimum of each term. A prior of 5 cm holds a term without information at zero.
     """
     for i in range(6):
         A[i, i] += wp.float64(400.0)
@@ -76,7 +76,7 @@ def in_metres_twist(xi: vec6d, length: wp.float64) -> vec6d:
 
 @wp.func
 def _ratio(sums: wp.array3d[wp.float64], b: int, part: int, whole: int) -> wp.float64:
-    """Ratio of two sums of env b, of which the second is a count."""
+    """Ratio of two sums of env b; the second one is a count."""
     return sums[b, 0, part] / wp.max(sums[b, 0, whole], wp.float64(1.0))
 
 
@@ -90,9 +90,9 @@ def _without_open_directions(
     matched: wp.float64,
     length: wp.float64,
 ) -> wp.mat44d:
-    """The pose T, but the predicted one along the directions that the view leaves open.
+    """The pose T with its unconstrained directions replaced by those of the predicted pose.
 
-    Coarser levels may have moved along what turns out to be open.
+    Coarser levels may have moved along a direction that turns out to be unconstrained.
     """
     deviation = in_metres_twist(se3_log(invert_rigid(predicted) * T), length)
     for k in range(6):
@@ -107,7 +107,7 @@ def _without_open_directions(
 
 @wp.kernel
 def assess_alignment(
-    hypotheses: Hypotheses,  # (B, 1); out: the pose where it is degenerate
+    hypotheses: Hypotheses,  # (B, 1); out: the pose, if degenerate
     predicted: wp.array[wp.mat44d],  # (B,) T_model_live
     thresholds: wp.array[DeviceThresholds],  # (B,)
     T_world_model: wp.array[wp.mat44d],  # in: pose of the model view
@@ -116,9 +116,9 @@ def assess_alignment(
     statistics: wp.array[DeviceStatistics],
     covariance: wp.array[mat66d],  # (B,) of the twist xi, T_world_live exp(xi)
 ) -> None:
-    """Compare what the alignment explained with the thresholds; write status, figures and pose.
+    """Compare the alignment with the thresholds; write its status, statistics and pose.
 
-    Along directions that the view leaves open the pose is the predicted one.
+    Along directions that the view does not constrain, the pose is the predicted one.
     """
     b = wp.tid()
     one = wp.float64(1.0)
@@ -166,18 +166,17 @@ LARGEST_SIGMA = 0.04  # (metres, radians) of the worst direction that the view c
 def acceptance_thresholds(
     config: AcceptanceConfig, strict: NDArray[np.bool_], lost: NDArray[np.int32]
 ) -> NDArray[Any]:
-    """Thresholds (B,) of ordinary tracking, or ``strict`` ones where a wide search found the pose.
+    """Thresholds (B,) for ordinary tracking, or ``strict`` ones for poses found by a wide search.
 
-    Strict ones are never laxer than those of ``config``, which ordinary tracking has.
+    Ordinary thresholds are those of ``config``; strict ones are never laxer. The allowed motion
+    grows with the number of frames for which tracking has been ``lost``.
 
-    The motion may be larger the longer, in frames, tracking has been ``lost``.
-
-    Chosen on 800 good and 80 wrong alignments of random walks with steps of 3, 6 and 10 cm and
-    degrees in six scenes at 160x120, of which they refused 0.3 % of the good ones. The self-similar
-    carpet fits itself at wrong places but for its cost, which is 1.5 there and below 1.3 at right
-    ones. With grey values compared at the recording's exposure and scale, they refused 1 of 1,490
-    frames of five scenes, hand-held with 4 cm and 2 degrees a frame, whose colour was not
-    registered with depth, half of them with exposure jumps, rolling shutter and holes besides.
+    They were chosen on 800 good and 80 wrong alignments of random walks with steps of 3, 6 and
+    10 cm and degrees in six scenes at 160x120; they refused 0.3 % of the good ones. A self-similar
+    carpet fits itself at wrong places in all but its cost: 1.5 there, below 1.3 at right places.
+    With grey values compared at the recording's exposure and scale, they refused 1 of 1,490 frames
+    of five hand-held scenes (4 cm and 2 degrees a frame, colour not registered with depth; half of
+    the frames also had exposure jumps, rolling shutter and holes).
     """
     return _acceptance_thresholds(config, tuple(strict.tolist()), tuple(lost.tolist())).copy()
 
@@ -215,8 +214,7 @@ _FIT = ("cost", "depth_conflict_ratio", *_RATIOS)
 USUAL = np.dtype([(name, np.float64) for name in (*_FIT, "surprise")])
 """What alignments are like that were accepted of late: of a recording's own noise.
 
-``surprise`` is the difference between motion and expected motion, in metres or radians, whichever
-is more.
+``surprise`` is the difference between motion and expected motion: the larger of metres and radians.
 """
 _FOLLOWS = 0.1  # share of the way from what is usual to the last frame
 _EXPECTED = {
@@ -246,11 +244,11 @@ def follow_usual(usual: NDArray[Any], statistics: NDArray[Any], surprise: Float6
 
 
 def at_usual_noise(thresholds: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any]:
-    """Thresholds (B,) for recordings that usually fit as ``usual`` (B,) says.
+    """Relax thresholds (B,) by the noise that the running statistics ``usual`` (B,) show.
 
-    Those of ``acceptance_thresholds`` suit the noise of a rendered Kinect, of which ``_EXPECTED``
-    holds the worst that is usual. A HoloLens, or a real Kinect, has a cost of 1.2 to 1.3: what is
-    demanded of it is less by the difference.
+    ``acceptance_thresholds`` suit the noise of a rendered Kinect; ``_EXPECTED`` holds its worst
+    usual values. A HoloLens or a real Kinect has a usual cost of 1.2 to 1.3, so its thresholds are
+    relaxed by the difference.
     """
     relaxed = thresholds.copy()
     for name, largest in _LARGEST.items():
@@ -265,7 +263,7 @@ def at_usual_noise(thresholds: NDArray[Any], usual: NDArray[Any]) -> NDArray[Any
 
 
 def geometric_thresholds(config: AcceptanceConfig, lost: NDArray[np.int32]) -> NDArray[Any]:
-    """Thresholds (B,) of an alignment by geometry alone near the expected pose."""
+    """Thresholds (B,) for an alignment by geometry alone near the expected pose."""
     thresholds = acceptance_thresholds(config, np.ones(len(lost), dtype=bool), lost)
     thresholds["photometric_inlier_ratio"], thresholds["cost"] = 0.0, np.inf
     thresholds["degenerate_directions"] = 3
@@ -275,13 +273,13 @@ def geometric_thresholds(config: AcceptanceConfig, lost: NDArray[np.int32]) -> N
 
 @dataclass(frozen=True)
 class Alignment:
-    """What ``Tracker.align`` found for B envs."""
+    """The result of ``Tracker.align`` for B envs."""
 
-    T_world_live: Float64  # (B, 4, 4) pose after alignment, good or not
-    T_model_live: Float64  # (B, 4, 4) the same, relative to the pose of the model view
+    T_world_live: Float64  # (B, 4, 4) pose after alignment, accepted or not
+    T_model_live: Float64  # (B, 4, 4) that pose relative to the pose of the model view
     status: NDArray[np.int32]  # (B,) ``TrackingStatus``
     statistics: NDArray[Any]  # (B,) figures behind the status, ``AlignmentStatistics`` each
-    # (B,) how the live grey values relate to the model's, ``Photometry`` each.
+    # (B,) relation of the live grey values to the model's, ``Photometry`` each.
     photometry: NDArray[Any]
     # (B, 6, 6) of the twist (rho, phi), metres and radians, with the true pose T_world_live
     # exp(twist).
@@ -290,27 +288,27 @@ class Alignment:
 
     @property
     def tracked(self) -> NDArray[np.bool_]:
-        """Which envs (B,) have a pose that is accepted."""
+        """Which envs (B,) have an accepted pose."""
         return self.status == TrackingStatus.OK
 
     @property
     def uncertain(self) -> NDArray[np.bool_]:
-        """Which envs (B,) have a pose that is doubtful."""
+        """Which envs (B,) have a doubtful pose."""
         return self.status == TrackingStatus.UNCERTAIN
 
     def status_under(self, thresholds: AcceptanceThresholds, env: int) -> TrackingStatus:
-        """What other thresholds say of an env's alignment."""
+        """Status of an env's alignment under other thresholds."""
         found = AlignmentStatistics(*self.statistics[env].tolist())
         return TrackingStatus(evaluate_alignment(found, thresholds))
 
     def with_status(self, where: NDArray[np.bool_], status: TrackingStatus) -> Alignment:
-        """The same with another status for the envs ``where`` (B,)."""
+        """A copy with another status for the envs ``where`` (B,)."""
         if not where.any():
             return self
         return replace(self, status=np.where(where, status, self.status))
 
     def doubtful_at(self, poses: Float64, photometry: NDArray[Any]) -> Alignment:
-        """Uncertain ones at other poses (B, 4, 4), which the map says nothing about."""
+        """A copy, uncertain and at other poses (B, 4, 4), about which the map says nothing."""
         return replace(
             self,
             T_world_live=poses,
@@ -320,7 +318,7 @@ class Alignment:
         )
 
     def seen_from(self, T_world_model: Float64) -> Alignment:
-        """The same, relative to other poses (B, 4, 4) of the model view."""
+        """A copy relative to other poses (B, 4, 4) of the model view."""
         return replace(self, T_model_live=invert(T_world_model) @ self.T_world_live)
 
     def replace(self, where: NDArray[np.bool_], other: Alignment) -> Alignment:
@@ -339,9 +337,9 @@ DOUBT_M, DOUBT_RAD = 0.03, 0.02
 def is_nearly_accepted(
     alignment: Alignment, env: int, config: AcceptanceConfig, usual: NDArray[Any]
 ) -> bool:
-    """Whether a refused alignment deserves a closer look: by somewhat laxer thresholds.
+    """Whether a refused alignment passes somewhat laxer thresholds and deserves a closer look.
 
-    ``usual`` (1,) is what alignments of the env are like.
+    ``usual`` (1,) holds the running statistics of the env.
     """
     doubted = config.doubted
     thresholds = AcceptanceThresholds(
@@ -430,7 +428,7 @@ def follow_drift(
 
 
 def accept_any_fit(alignment: Alignment) -> Alignment:
-    """The same with a good status wherever there was something to align at all."""
+    """A copy with status OK wherever there was anything to align."""
     is_blank = alignment.status == TrackingStatus.BLANK
     usable = (alignment.status != TrackingStatus.FEW_POINTS) & ~is_blank
     usable &= np.isfinite(alignment.T_world_live).all(axis=(1, 2))

@@ -43,26 +43,25 @@ class SurfelSlam(SlamBackend):
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """(width, height) that frames are reduced to: the camera's own unless reconfigured."""
+        """(width, height) to which frames are reduced; the camera's own unless reconfigured."""
         return self._slam.intrinsics.width, self._slam.intrinsics.height
 
     def reconfigure(self, config: SurfelConfig, image_size: tuple[int, int] | None = None) -> None:
-        """Go on with other parameters: map, pose, motion and keyframes stay as they are.
+        """Continue with other parameters; keep the map, pose, motion and keyframes.
 
-        With those in force already nothing changes, bit for bit. The state of ``get_state`` does
-        not hold them: it is set where they are in force.
+        Setting the present parameters again changes no bit of the results. The state of
+        ``get_state`` does not hold the parameters: restore it with the same ones in force.
 
         Args:
-            config: differs in nothing that ``pipeline.FIXED`` names. Loop closure keeps the
-                parameters that it was made with, and ferns the depths that they ask for.
-            image_size: (width, height) that frames are reduced to before anything else; None for
-                the size they have. ``track`` takes frames of the camera's own size all the same,
-                and ``predict`` renders views of it. With another size the motion mask, and the
-                features of the last frame, start anew.
+            config: the new parameters; those in ``pipeline.FIXED`` must not change. Loop closure
+                keeps the parameters that it was made with, and ferns keep their depth range.
+            image_size: (width, height) to which frames are reduced first; None keeps their size.
+                ``track`` still takes frames of the camera's own size, and ``predict`` still renders
+                views of that size. A new size resets the motion mask and the features of the last
+                frame.
 
         Raises:
-            InputError: a change of what must stay, or a size that the camera's frames cannot be
-                reduced to.
+            InputError: a fixed parameter changes, or frames cannot be reduced to ``image_size``.
         """
         own = self.intrinsics
         width, height = image_size or (own.width, own.height)
@@ -75,11 +74,11 @@ class SurfelSlam(SlamBackend):
 
     @property
     def map(self) -> SurfelMap:
-        """The surfels of the present submap, with all that is joined to it."""
+        """The surfels of the present submap and of all submaps joined to it."""
         return self._slam.map
 
     def reset(self, T_world_camera: ArrayLike | None = None) -> None:
-        """Forget everything; the next frame is taken at ``T_world_camera`` (identity if None)."""
+        """Forget everything; the next frame has the pose ``T_world_camera`` (identity if None)."""
         self._slam.reset(T_world_camera)
         self._submaps.reset()
         if self._color_camera is not None:
@@ -102,7 +101,7 @@ class SurfelSlam(SlamBackend):
         return self._slam.fuse(color, depth, pose[None], [frame.timestamp])[0]
 
     def _images(self, frame: RGBDFrame) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Colour (1, h, w, 3) and depth (1, h, w) at the size in force."""
+        """Colour (1, h, w, 3) and depth (1, h, w) at ``image_size``."""
         check_frame(frame, self.intrinsics)
         color, depth = frame.color, frame.depth
         if self._slam.intrinsics != self.intrinsics:
@@ -114,15 +113,15 @@ class SurfelSlam(SlamBackend):
         return color, depth
 
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
-        """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times the size."""
+        """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times image size."""
         return self.map.predict(check_views(poses, scale), scale)
 
     def surface_points(self) -> Float64:
-        """All living surfels (M, 3): the stable ones and the young ones seen of late.
+        """Positions (M, 3) of all living surfels: stable ones, and young ones seen recently.
 
-        Episodes are too short for most surfels to become stable, and the map itself removes
-        those that stay unconfirmed. First those of the present submap, then those of the submaps
-        that it is not joined to, where they lie by the best guess.
+        Young ones count because episodes are too short for most surfels to become stable; the map
+        removes those that stay unconfirmed. Surfels of the present submap come first, then those
+        of submaps that are not joined to it, placed by the best guess.
         """
         return self._living("position").astype(np.float64)
 
@@ -142,35 +141,35 @@ class SurfelSlam(SlamBackend):
         return attributes
 
     def _living(self, name: str) -> NDArray[np.float32]:
-        """Array ``name`` of the living surfels of all submaps."""
+        """Attribute ``name`` of the living surfels of all submaps."""
         present = self.map.attribute(name, stable=False)
         others = [each.surfels[name][each.living] for each in self._submaps.detached]
         return np.concatenate([present, *others]) if others else present
 
     def corrected_trajectory(self) -> tuple[NDArray[np.int32], Float64]:
-        """Fused frames (N,) and their poses (N, 4, 4) as the maps have them now; see the base."""
+        """Fused frames (N,) and their poses (N, 4, 4) in the present maps; see the base class."""
         return self._submaps.trajectory()
 
     def submaps(self) -> Submaps:
-        """The submaps, as they hang together now."""
+        """The submaps and the links between them."""
         return self._submaps.summary()
 
     @property
     def frames_counted(self) -> int:
-        """Number of the next frame, as trajectory and submaps count them."""
+        """Index of the next frame, as the trajectory and the submaps count."""
         return self._slam.last_frame() + 1
 
     @property
     def closes_loops(self) -> bool:
-        """Whether the map is bent where it comes back to a place."""
+        """Whether the map is deformed when the camera returns to a place."""
         return self.config.loop_closure != "none"
 
     def mark_lost(self) -> None:
-        """Seek the next frame in the map, near the last pose and at keyframes like it."""
+        """Relocalize the next frame: search near the last pose and at similar keyframes."""
         self._slam.mark_lost()
 
     def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays."""
+        """Everything needed to continue bit-exactly, as NumPy arrays."""
         color = {} if self._color_camera is None else self._color_camera.get_state()
         return self._slam.get_state() | color | {"submaps": self._submaps.get_state()}
 
@@ -180,7 +179,7 @@ class SurfelSlam(SlamBackend):
         return self._slam.state_like() | color | {"submaps": self._submaps.state_like()}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` returned."""
+        """Restore a state that ``get_state`` returned."""
         check_has(state, ("submaps",), type(self).__name__)
         self._slam.set_state(state)
         self._submaps.set_state(state["submaps"])

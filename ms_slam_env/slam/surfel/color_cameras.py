@@ -1,9 +1,8 @@
-"""Whether colour is registered with depth, and what to do where it is not.
+"""Estimate and undo the offset of a colour camera that is not registered with depth.
 
-The offset of the colour camera is found from the edges that colour and depth share. Objects end
-where depth steps, and mostly so does their colour: the offset is the one that puts the near sides
-of depth steps where the colour's gradient is steepest, summed over many frames (after Levinson and
-Thrun, "Automatic online calibration of cameras and lasers", RSS 2013).
+Objects end where depth steps, and their colour usually ends there, too. So the offset is the one
+that puts the near sides of depth steps where the colour gradient is steepest, summed over many
+frames (after Levinson and Thrun, "Automatic online calibration of cameras and lasers", RSS 2013).
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from ms_slam_env.slam.shared.state_check import ArrayOf, ListOf
 from ms_slam_env.slam.slam_backend import TrackResult
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 
-FEWEST_EDGES = 500  # points on depth steps that the offset is estimated from
-LEAST_GAIN = 1.1  # of their mean gradient, by which cameras are believed to be apart
+FEWEST_EDGES = 500  # points on depth steps needed to estimate the offset
+LEAST_GAIN = 1.1  # factor in mean gradient from which an offset is believed
 _STEP = 0.04  # of inverse depth, 1/m
 _RANGES = ((0.85, 1.15), (-0.06, 0.06))  # of focal ratio and baseline, metres
 _SIMPLEX = np.array([[0.0, 0.0], [0.01, 0.0], [0.0, 0.004]])
-_BLURS_PX = (1.5, 0.7)  # of the gradients: to find the place, and to find it exactly
-_STEEPEST = 3.0  # times the mean gradient: beyond it an edge is an edge
-_BORDER = 2  # rows and columns that are left out
+_BLURS_PX = (1.5, 0.7)  # of the gradients, for the coarse and the fine search
+_STEEPEST = 3.0  # times the mean gradient, at which gradients are clipped
+_BORDER = 2  # rows and columns left out at each side
 
 
 def depth_edges(depth: Float32, intrinsics: Intrinsics) -> Float64:
@@ -56,11 +55,11 @@ def estimate_camera_offset(
 
     Args:
         colors: images (H, W, 3) of the colour camera.
-        edges: points (N, 3) of each, as ``depth_edges`` finds them.
+        edges: edge points (N, 3) of each frame, from ``depth_edges``.
         intrinsics: of the depth camera.
 
     Returns:
-        None where there are too few edges, or those of colour and depth lie together as they are.
+        None if there are too few edges, or if colour and depth edges already coincide.
     """
     given = [(color, points) for color, points in zip(colors, edges, strict=True) if len(points)]
     if sum(len(points) for _, points in given) < FEWEST_EDGES:
@@ -87,7 +86,7 @@ def estimate_camera_offset(
 
 
 def _gradient(color: NDArray[np.uint8], blur_px: float) -> Float32:
-    """Steepness (H, W) of an image's grey values, 1 on average."""
+    """Gradient magnitude (H, W) of an image's grey values, about 1 on average."""
     grey = cv2.cvtColor(np.ascontiguousarray(color), cv2.COLOR_RGB2GRAY).astype(np.float32)
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
     slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)) / 8
@@ -102,7 +101,7 @@ def _steepness(
     focal_ratio: float,
     baseline_m: float,
 ) -> float:
-    """Mean gradient at the places where a colour camera sees the edges."""
+    """Mean gradient at the pixels where a colour camera sees the edges."""
     K, total = intrinsics, 0.0
     for gradient, (x, y, z) in zip(gradients, (points.T for points in places), strict=True):
         u = focal_ratio * K.fx * (x - baseline_m) / z + K.cx
@@ -114,16 +113,17 @@ def _steepness(
     return total / sum(map(len, places))
 
 
-ENOUGH_EDGES = 6000  # points on depth steps, or
-MOST_FRAMES = 60  # frames after which the offset of the cameras is estimated
+# The offset is estimated after this many points on depth steps, or this many frames.
+ENOUGH_EDGES = 6000
+MOST_FRAMES = 60
 
 
 class EstimatedColorCamera(Saved):
-    """Where the colour camera is: looked for in the first frames, and then undone.
+    """Estimates the offset of the colour camera from the first frames, and then undoes it.
 
-    Once it is found those frames, of which at most ``MOST_FRAMES`` are kept until then, are tracked
-    once more with their colour registered, as a new map. Should one of them have been lost or fused
-    at a known pose, the map stays as it is, and later frames alone are registered.
+    Until then, at most ``MOST_FRAMES`` frames are kept. Once the offset is found, they are tracked
+    again with registered colour, into a new map. If one of them was lost or was fused at a known
+    pose, the map stays as it is and only later frames are registered.
     """
 
     saved = (
@@ -134,10 +134,10 @@ class EstimatedColorCamera(Saved):
         self.reset(None)
 
     def reset(self, T_world_camera: ArrayLike | None) -> None:
-        """Begin anew at a pose (4, 4)."""
+        """Start over at a pose (4, 4)."""
         self._start: Float64 = np.eye(4) if T_world_camera is None else np.array(T_world_camera)
         self._offset: Float64 = np.full(2, np.nan)  # focal ratio and baseline; NaN: not known yet
-        self._is_whole = True  # nothing but the frames kept is in the map
+        self._is_whole = True  # the map holds the kept frames and no others
         self._forget()
 
     def state_like(self) -> Any:
@@ -177,7 +177,7 @@ class EstimatedColorCamera(Saved):
         guess: ArrayLike | None,
         time_s: float,
     ) -> TrackResult:
-        """Let a frame be tracked."""
+        """Track a frame, and estimate the offset once enough frames are kept."""
         result = slam.track(color, depth, [guess], [time_s])[0]
         if self._is_known:
             return result
@@ -201,7 +201,7 @@ class EstimatedColorCamera(Saved):
         return result
 
     def _track_again(self, slam: BatchedSurfelSlam) -> TrackResult:
-        """Begin anew with the frames kept."""
+        """Start over with the kept frames."""
         slam.reset(self._start)
         kept: Any = zip(self._colors, self._depths, self._guesses, self._times, strict=True)
         for color, depth, guess, time_s in kept:

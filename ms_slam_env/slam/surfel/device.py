@@ -2,13 +2,13 @@
 # ruff: noqa: F811
 """Arrays on the device: unchecked access in kernels, host-device buffers, recorded launches.
 
-Warp's own indexing takes negative indices and any strides, which costs more than most of the
-arithmetic here, and keeps the compiler from working on eight pixels at once. So does Warp's
-``for ... in range``, whose step is a variable: inner loops that matter are ``while`` loops. On one
-core of an AMD EPYC a loop over 19,200 pixels with five operations each took 43 microseconds with
-indexing and ``for``, 32 with ``while``, 5 with ``while``, ``fetch`` and ``put``. Their arrays are
-one-dimensional and contiguous, such as ``array.flatten()``, or rows; indices are checked in a
-checked build alone (``ms_slam_env.native``).
+Warp's own indexing allows negative indices and any strides. That costs more than most of the
+arithmetic here and keeps the compiler from vectorizing over eight pixels. Warp's
+``for ... in range`` does, too, because its step is a variable; so inner loops that matter are
+``while`` loops. On one core of an AMD EPYC, a loop over 19,200 pixels with five operations each
+took 43 microseconds with indexing and ``for``, 32 with ``while``, and 5 with ``while``, ``fetch``
+and ``put``. ``fetch`` and ``put`` take contiguous one-dimensional arrays, such as
+``array.flatten()``, or rows. Only a checked build (``ms_slam_env.native``) checks their indices.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class SavedBuffer(_warp.HostDeviceBuffer, Stateful):
 class KernelLaunchCache:
     """Recorded launches by key, for kernels whose arguments are the same objects every time.
 
-    Packing the arguments of a launch costs more time than a small kernel (24 against 4
-    microseconds measured on one core); tracking repeats the same hundred launches every frame.
+    Packing the arguments of a launch takes longer than a small kernel (24 microseconds against 4 on
+    one core), and tracking repeats the same hundred launches every frame.
     """
 
     def __init__(self, device: str) -> None:
@@ -49,15 +49,15 @@ class KernelLaunchCache:
         self._commands: dict[Hashable, RecordedLaunch] = {}
 
     def clear(self) -> None:
-        """Forget all: the arguments have become other objects."""
+        """Forget all launches; call it when the arguments have become other objects."""
         self._commands.clear()
 
     def launch(
         self, key: Hashable, kernel: Any, arguments: Callable[[], tuple[Dim, Sequence[Any]]]
     ) -> None:
-        """Launch what was recorded under ``key``, or else ``kernel``, and record that.
+        """Repeat the launch recorded under ``key``; if there is none, launch ``kernel`` and record.
 
-        ``arguments`` gives the number of threads and what the kernel takes.
+        ``arguments`` returns the number of threads and the kernel's inputs.
         """
         command = self._commands.get(key)
         if command is None:
@@ -68,9 +68,9 @@ class KernelLaunchCache:
 
 
 def threads_per_row(width: int, device: str, gpu_columns: int = 1) -> tuple[int, int]:
-    """Columns of an image that one thread goes through, and how many threads a row has.
+    """Number of image columns per thread, and number of threads per row.
 
-    The CPU runs one thread after another: whole rows. A GPU wants many threads.
+    The CPU runs threads one after another, so a thread takes a whole row. A GPU needs many threads.
     """
     columns = gpu_columns if wp.get_device(device).is_cuda else width
     return columns, -(-width // columns)
@@ -82,11 +82,11 @@ for _dtype in (wp.float32, wp.int32, wp.uint8, wp.vec3):
 
     @wp.func_native(native_source("arrays", f"fetch_{_kind}"))
     def fetch(values: wp.array[_dtype], i: int) -> _dtype:
-        """Value ``i``."""
+        """Return value ``i``."""
 
     @wp.func_native(native_source("arrays", f"fetch_{_kind}_in_row"))
     def fetch(values: wp.array2d[_dtype], row: int, i: int) -> _dtype:
-        """Value ``i`` of a row."""
+        """Return value ``i`` of a row."""
 
     @wp.func_native(native_source("arrays", f"put_{_kind}"))
     def put(values: wp.array[_dtype], i: int, value: _dtype) -> None:
@@ -99,4 +99,4 @@ for _dtype in (wp.float32, wp.int32, wp.uint8, wp.vec3):
 
 @wp.func_native(native_source("arrays", "raise_to"))
 def raise_to(values: wp.array[wp.float32], i: int, value: wp.float32) -> None:
-    """Make value ``i`` at least ``value``, also when other threads do so at the same time."""
+    """Atomically raise value ``i`` to at least ``value``."""

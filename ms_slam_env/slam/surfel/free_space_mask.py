@@ -1,13 +1,13 @@
 # ruff: noqa: UP018, RUF046
-"""Which readings of the live frames belong to things that move, by geometry alone.
+"""Mask the readings of the live frames that belong to moving things, by geometry alone.
 
-A reading in space that an earlier frame saw to be free has come there: the free-space violation of
+A reading in space that an earlier frame saw free has appeared there: the free-space violation of
 ReFusion (Palazzolo et al., IROS 2019), tested against a few earlier depth images instead of a
-volume. What comes into view from behind something else is not taken for moving, as it would be by
-its distance from the map's view. A point of an earlier frame that the live frame looks through has
-gone away. Both are evidence on the pieces into which depth and normals cut the image (StaticFusion,
-Scona et al., ICRA 2018, clusters likewise), kept as log-odds of each pixel and carried from frame
-to frame.
+volume. Surfaces that come into view from behind others are not masked; a test of the distance to
+the map's view would mask them. A point of an earlier frame that the live frame looks through has
+vanished. Both are evidence about segments of the image, cut by depth and normals (StaticFusion,
+Scona et al., ICRA 2018, clusters in a similar way). The evidence is kept as log-odds per pixel and
+carried from frame to frame.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from ms_slam_env.slam.surfel.preprocessing import LiveFrame, Pieces
 from ms_slam_env.slam.surfel.rendering import ModelView
 from ms_slam_env.slam.surfel.surfel_config import SurfelConfig
 
-PAST = wp.constant(6)  # earlier frames that the live one is compared with
+PAST = wp.constant(6)  # earlier frames with which the live one is compared
 KNOWN, SUPPORTED, APPEARED, VANISHED = (wp.constant(1 << bit) for bit in range(4))
-"""Of a reading: an earlier frame saw its place; it was there in an old one already; its place was
-free; what was in front of it has gone."""
+"""Evidence about a reading: an earlier frame saw its place; an old frame saw it already; its place
+was free before; something in front of it has gone."""
 UNUSED, RECENT, OLD = (wp.constant(age) for age in range(3))
-RECEDED_M = wp.constant(0.6)  # what is farther behind did not recede there, but was uncovered
-NEAREST_M = wp.constant(0.03)  # smallest distance that is no noise
+RECEDED_M = wp.constant(0.6)  # a surface farther behind was uncovered; it did not recede
+NEAREST_M = wp.constant(0.03)  # smallest distance that cannot be noise
 
 
 @wp.struct
@@ -52,7 +52,7 @@ class Grid:
 
 
 def make_grid(intrinsics: Intrinsics, columns: int, sigma: float) -> Grid:
-    """A grid of about so many columns; ``sigma`` is its tolerance at 1 m."""
+    """A grid of about ``columns`` columns; ``sigma`` is its tolerance at 1 m."""
     stride = max(1, round(intrinsics.width / columns))
     small = intrinsics.every_nth(stride)
     grid = Grid()
@@ -65,7 +65,7 @@ def make_grid(intrinsics: Intrinsics, columns: int, sigma: float) -> Grid:
 
 @wp.func
 def tolerance(z: float, grid: Grid) -> float:
-    """Difference of depth, metres, that is neither noise nor an inexact pose."""
+    """Depth difference, metres, beyond what noise or an inexact pose explain."""
     return wp.max(grid.sigma * z * z, NEAREST_M)
 
 
@@ -107,9 +107,9 @@ def sample_depth(
     depth: wp.array[wp.float32],
     nearest: wp.array[wp.float32],
 ) -> None:
-    """Filtered depth on the grid, and the smallest raw reading around each of its pixels.
+    """Sample filtered depth on the grid, and the smallest raw reading around each of its pixels.
 
-    Where the pixel itself has no reading it is 0: what lies there is not known.
+    The smallest reading is 0 (unknown) where the pixel itself has no reading.
     """
     b, v = wp.tid()
     image = b * grid.live_height * grid.live_width
@@ -143,7 +143,7 @@ def find_appeared(
     grid: Grid,
     found: wp.array[wp.int32],
 ) -> None:
-    """Which readings are where an earlier frame saw free space, and of which that is known."""
+    """Mark readings where an earlier frame saw free space, and those where any frame looked."""
     b, v = wp.tid()
     row = (b * grid.height + v) * grid.width
     pixels = grid.height * grid.width
@@ -173,7 +173,7 @@ def find_appeared(
 def find_vanished(
     nearest: wp.array[wp.float32],
     past_depth: wp.array[wp.float32],
-    masked: wp.array[wp.int32],  # (B * h * w), of the live frames as far as is known
+    masked: wp.array[wp.int32],  # (B * h * w), the present mask of the live frames
     T_live_past: wp.array2d[wp.mat44],  # (B, PAST)
     age: wp.array2d[wp.int32],  # (B, PAST)
     grid: Grid,
@@ -181,10 +181,11 @@ def find_vanished(
 ) -> None:
     """Mark where the live frame looks through a point of an earlier frame.
 
-    What was known to move has left its place anyway: that says nothing of what it has uncovered.
+    A point already known to move says nothing about the surface that it uncovers, unless that
+    surface is masked.
     """
     b, k, v = wp.tid()
-    if age[b, k] != OLD:  # since then it has gone far enough to tell
+    if age[b, k] != OLD:  # only since an old frame has it moved far enough to tell
         return
     pixels = grid.height * grid.width
     row = (b * PAST + k) * pixels + v * grid.width
@@ -213,7 +214,7 @@ def carry_log_odds(
     grid: Grid,
     odds: wp.array[wp.float32],
 ) -> None:
-    """Log-odds of the last frame at the live readings: from the pixel around of the next depth."""
+    """Carry log-odds of the last frame to live readings, from the nearby pixel closest in depth."""
     b, v = wp.tid()
     row = (b * grid.height + v) * grid.width
     pixels = grid.height * grid.width
@@ -325,7 +326,7 @@ def hide(
     normals: wp.array2d[wp.vec3],
     intensity: wp.array2d[wp.float32],
 ) -> None:
-    """Leave what the masked readings lie upon out of a view of the map."""
+    """Empty a view of the map at the pixels that masked readings cover."""
     b, i = wp.tid()
     p = vertices[b, i]
     if p[2] > 0.0:
@@ -339,7 +340,7 @@ def hide(
 
 @wp.kernel
 def enlarge(masked: wp.array[wp.int32], grid: Grid, image: wp.array[wp.int32]) -> None:
-    """The mask of the grid at the size of the live images."""
+    """Enlarge the mask of the grid to the size of the live images."""
     b, v = wp.tid()
     half = grid.stride / 2
     line = wp.min((v + half) / grid.stride, grid.height - 1)
@@ -370,12 +371,12 @@ def leave_out(
 
 
 class MotionMask(Saved):
-    """Tells which readings of the live frames of B envs belong to things that move.
+    """Masks the readings of the live frames of B envs that belong to moving things.
 
-    This one takes the world to be still.
+    This base class assumes a static world and masks nothing.
 
     Attributes:
-        can_doubt: whether it ever finds anything.
+        can_doubt: whether ``doubts`` can ever be true.
     """
 
     can_doubt = False
@@ -385,44 +386,44 @@ class MotionMask(Saved):
         self.resize(intrinsics)
 
     def resize(self, intrinsics: Intrinsics) -> None:
-        """Go on with frames of another size; what was seen at the old one is forgotten."""
+        """Continue with frames of another size; forget what was seen at the old one."""
 
     def forget(self, env: int) -> None:
         """Forget what one env has seen."""
 
     def expect(self, live: LiveFrame, T_world_live: Float64, is_known: Bool) -> None:
-        """Take what moved in the last frames to new ones at about ``T_world_live`` (B, 4, 4).
+        """Carry the mask of the last frames to new ones at about ``T_world_live`` (B, 4, 4).
 
-        Where that is not known, ``is_known`` (B,), nothing is masked.
+        Nothing is masked in envs whose pose is not known, by ``is_known`` (B,).
         """
 
     def find(self, T_world_live: Float64, is_known: Bool, strict: bool = False) -> Bool:
-        """Look for what moves in the frames, taken at poses (B, 4, 4).
+        """Look for moving things in the frames, taken at poses (B, 4, 4).
 
-        If ``strict``, what no earlier frame but the last few has seen is taken for moving; in the
-        first frames, all that is near.
+        If ``strict``, a surface counts as moving unless an earlier frame, older than the last few,
+        has seen it; in the first frames, every near surface counts as moving.
 
         Returns:
-            (B,) whether so much is new in the mask that the frame should be aligned again.
+            (B,) whether the mask has changed so much that the frame should be aligned again.
         """
         return np.zeros(self._batch, dtype=bool)
 
     def doubts(self) -> Bool:
-        """Where (B,) what is new in the frames is enough to lead a pose astray, were it moving."""
+        """Envs (B,) with enough new surface to lead the pose astray, should it be moving."""
         return np.zeros(self._batch, dtype=bool)
 
     def confirm(self, where: Bool) -> None:
-        """Believe what the last ``strict`` look found, for the envs ``where`` (B,)."""
+        """Accept the findings of the last ``strict`` look for the envs ``where`` (B,)."""
 
     def hide(self, view: ModelView, T_world_model: Float64) -> bool:
-        """Empty a view of the maps where masked readings lie; whether there are any.
+        """Empty a view of the maps under the masked readings; return whether there are any.
 
         ``T_world_model`` (B, 4, 4) are the poses of the view.
         """
         return False
 
     def remember(self, live: LiveFrame, T_world_live: Float64, good: Bool) -> None:
-        """Mask ``live``; take it as seen from poses (B, 4, 4), where that is ``good`` (B,)."""
+        """Mask ``live``, and keep it for comparison, at poses (B, 4, 4), where ``good`` (B,)."""
 
     def share(self) -> Float64:
         """Share (B,) of the readings that are masked."""
@@ -454,7 +455,7 @@ FOR, AGAINST, FORGETTING = 2.0, 0.7, 0.15  # log-odds of an observation
 MOST, LEAST = 4.0, -2.0  # log-odds at which they end
 CONFIRMED = 1.2  # log-odds of what has drawn a pose along: seen to move or forgotten soon
 MASKED = 0.5  # log-odds above which a pixel is masked
-CHANGED = 0.01  # share of the pixels whose new mask makes an alignment worth repeating
+CHANGED = 0.01  # share of newly masked pixels that makes an alignment worth repeating
 _RIM = np.ones((3, 3), dtype=np.uint8)
 
 
@@ -500,7 +501,7 @@ class GeometricMotionMask(MotionMask):
         self._count: NDArray[np.int32] = np.zeros(
             batch, dtype=np.int32
         )  # frames since the env was forgotten
-        # Frames to come in which what is new is not believed.
+        # Coming frames in which new surfaces are doubted.
         self._alert: NDArray[np.int32] = np.full(batch, FIRST, dtype=np.int32)
         self._sums = SavedBuffer((batch, grid.height, 4), wp.float64, device)
         self._slots = SavedBuffer(batch, wp.int32, device)
@@ -514,8 +515,8 @@ class GeometricMotionMask(MotionMask):
         self._moved: Bool = np.zeros(batch, dtype=bool)  # whether anything did in the last frames
         self._moves_now: Bool = np.zeros(batch, dtype=bool)  # and does in the live ones
         self._is_marked = True  # whether ``LiveFrame.moving`` may hold a mask
-        self._seen: LiveFrame | None = None  # whose launches are recorded
-        self._looked: Float64 | None = None  # what the mask at hand was found with
+        self._seen: LiveFrame | None = None  # the frame whose launches are recorded
+        self._looked: Float64 | None = None  # inputs from which the present mask was found
 
     def forget(self, env: int) -> None:
         """See the base class."""
@@ -552,7 +553,7 @@ class GeometricMotionMask(MotionMask):
         return self._depth.look_row(env)
 
     def _pieces_of(self, env: int) -> Pieces:
-        """Pieces of the live frame of an env, cut when they are first asked for."""
+        """Segments of the live frame of an env, cut at the first call."""
         if env not in self._pieces:
             stride = self._grid.stride
             normals = self._live.normals[env].numpy()[::stride, ::stride]
@@ -600,10 +601,10 @@ class GeometricMotionMask(MotionMask):
         return odds
 
     def _moves(self, env: int, found: NDArray[np.int32]) -> Bool:
-        """Where (h, w) the evidence of a frame says that something moves.
+        """Pixels (h, w) where the evidence of a frame says that something moves.
 
-        A piece moves as a whole if enough of what is known of it says so; besides, what has
-        appeared moves wherever several neighbours have.
+        A segment moves as a whole if enough of its known pixels say so. A pixel that has appeared
+        also moves if several of its neighbours have appeared.
         """
         appeared = (found & APPEARED) > 0
         around = cv2.boxFilter(appeared.astype(np.float32), -1, (3, 3), normalize=False)
@@ -617,7 +618,7 @@ class GeometricMotionMask(MotionMask):
         return moves | pieces.where(vanished, against, SHARE_VANISHED, least) | appeared
 
     def _is_new(self, env: int, is_still: Bool) -> Bool:
-        """Pieces (h, w) of which hardly a pixel was there in an old frame."""
+        """Pixels (h, w) of segments that old frames hardly support."""
         pieces = self._pieces_of(env)
         least = np.full(pieces.count, FEWEST - 1.0)
         return pieces.where(~is_still, is_still, SHARE_NEW, least)
@@ -699,7 +700,7 @@ class GeometricMotionMask(MotionMask):
         """``UNUSED``, ``RECENT`` or ``OLD`` for each (B, PAST) of the earlier frames."""
         stored = -(-self._count[:, None] // INTERVAL)
         slots = np.arange(PAST)
-        back = (stored - 1 - slots) % PAST  # how many are newer
+        back = (stored - 1 - slots) % PAST  # number of newer ones
         return np.where(slots < stored, np.where(back < NEW, RECENT, OLD), UNUSED)
 
     def _mask_by(self, odds: dict[int, Float32], T_world_live: Float64) -> None:

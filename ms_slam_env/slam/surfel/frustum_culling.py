@@ -1,10 +1,10 @@
 # mypy: disable-error-code="empty-body"
-"""Which surfels a camera may see: blocks of surfels with bounding boxes, then one by one.
+"""Find the surfels that a camera may see: test bounding boxes of blocks first, then surfels.
 
-New surfels are appended frame by frame, so those of a block were made close together. A camera
-tests the box of a block first: the cost of listing what is in view follows what is near the view,
-not what is stored. Boxes of the blocks in view are taken anew after every fusion, which alone moves
-surfels a little; other boxes stay as they are. The same holds for the time of removal.
+New surfels are appended frame by frame, so those of a block are close together. Testing boxes first
+makes the cost of culling follow the number of surfels near the view, not in the map. Only fusion
+moves surfels, and little; so after every fusion the boxes of the blocks in view are computed again
+and the others are kept. The same holds for the time of removal.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def bound_blocks(
 
 @wp.kernel
 def set_bounded(surfels: Surfels, blocks: CullingBlocks, capacity: int) -> None:
-    """Note that all boxes hold."""
+    """Mark all boxes as valid."""
     b = wp.tid()
     blocks.bounded[b] = wp.min(surfels.count[b], capacity)
 
@@ -111,9 +111,9 @@ def frustum_of(T_world_camera: wp.mat44, camera: SplatCamera, margin_px: float) 
 def list_some_visible_blocks(
     blocks: CullingBlocks, b: int, first: int, end: int, frustum: Frustum, row: int
 ) -> int:
-    """List those of the blocks from ``first`` on that reach into a frustum; how many were tested.
+    """List the blocks from ``first`` on that reach into a frustum; return the number tested.
 
-    A block is left out only if its box is wholly outside of one plane of the frustum.
+    A block is left out only if its box lies entirely outside one plane of the frustum.
     """
 
 
@@ -154,13 +154,13 @@ def list_some_visible(
     row: int,
     visible: VisibleList,
 ) -> int:
-    """List the visible ones of the surfels from ``first`` on; how many were looked at.
+    """List the visible surfels from ``first`` on; return the number tested.
 
-    Several at a time on the CPU, at most to ``end``; a thread of a GPU looks at one.
+    The CPU tests several at a time, at most to ``end``; a GPU thread tests one.
 
-    Discs of radius r pixels that make one surface number about 1 / r^2 a pixel: where ``layers``
-    of the frustum is finite one of them is listed with the probability ``layers`` r^2, by its slot
-    in the map, so always or never.
+    One surface takes about 1 / r^2 discs of radius r pixels per pixel. If ``layers`` of the frustum
+    is finite, a disc is listed with probability ``layers`` r^2, decided by its slot in the map and
+    so the same every time.
     """
 
 

@@ -68,13 +68,13 @@ def measure_consistency(
 
 
 class Relocalization(Saved):
-    """Where a lost frame of B envs is searched besides around the last good pose.
+    """Searches for the lost frames of B envs elsewhere than around the last good pose.
 
-    This is the variant that searches nowhere else: "local".
+    This base class is the variant "local", which searches nowhere else.
     """
 
     def add_keyframes(self, frames: Images, poses: Float64, time: Int32, tracked: Bool) -> None:
-        """Take note of the frames that were ``tracked`` (B,) at ``poses`` (B, 4, 4)."""
+        """Record the frames that were ``tracked`` (B,) at ``poses`` (B, 4, 4)."""
 
     def verify(self, frames: Images, poses: Float64, found: Bool, aligner: FrameAligner) -> Bool:
         """Which of the frames that were ``found`` (B,) again are really at ``poses`` (B, 4, 4)."""
@@ -93,10 +93,10 @@ class Relocalization(Saved):
     def propose(
         self, frames: Images, lost: Bool, attempts: Int32, aligner: FrameAligner
     ) -> Float64:
-        """Poses (B, 4, 4) at which the envs that are ``lost`` (B,) may be; NaN: none.
+        """Candidate poses (B, 4, 4) of the envs that are ``lost`` (B,); NaN: none.
 
-        The map's view from there is like the frame; nothing has confirmed them yet. Every attempt
-        (B,) looks elsewhere.
+        The map's view from there agrees with the frame, but nothing has confirmed them yet. Every
+        attempt (B,) looks elsewhere.
         """
         return np.full((len(lost), 4, 4), np.nan)
 
@@ -105,10 +105,10 @@ class Relocalization(Saved):
         return []
 
     def move_keyframes(self, env: int, time: Int32, poses: Float64) -> None:
-        """Follow a map that was deformed: frames ``time`` (N,) were at ``poses`` (N, 4, 4)."""
+        """Move keyframes with a deformed map: frames ``time`` (N,) are at ``poses`` (N, 4, 4)."""
 
     def adapt(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
-        """Expect frames of another size, and a map of readings up to another distance."""
+        """Prepare for frames of another size and another depth cutoff."""
 
     def clear(self, env: int) -> None:
         """Forget everything about one env."""
@@ -118,9 +118,9 @@ class Relocalization(Saved):
         return np.zeros((0, 4, 4))
 
     def least_dissimilarity(self, env: int, frames: Images, keyframes: dict[str, Any]) -> float:
-        """Of an env's frame and the one of some keyframes that resembles it most, in [0, 1].
+        """Dissimilarity in [0, 1] of an env's frame and the most similar of some keyframes.
 
-        Infinity where there is none.
+        Infinity without keyframes.
         """
         return np.inf
 
@@ -129,7 +129,7 @@ class Relocalization(Saved):
         return {}
 
     def keyframes_like(self) -> dict[str, Any]:
-        """What ``get_keyframes`` gives, as ``Stateful.state_like`` says it."""
+        """Description of what ``get_keyframes`` returns; see ``Stateful.state_like``."""
         return {}
 
     def set_keyframes(self, env: int, keyframes: dict[str, Any]) -> None:
@@ -315,7 +315,7 @@ class FernRelocalization(Relocalization):
         database.move(moved)
 
     def adapt(self, intrinsics: Intrinsics, depth_cutoff_m: float) -> None:
-        """Keyframes are compared as small images of one size, so that those at hand stay."""
+        """Keep the keyframes, which are compared as small images of one size; see the base."""
         for database in self.databases:
             database.expect_size(intrinsics)
         self._cutoff_m = depth_cutoff_m
@@ -352,10 +352,10 @@ class FernRelocalization(Relocalization):
 
 
 class FeatureRelocalization(FernRelocalization):
-    """Searches also where ORB features of such keyframes put the frame, if it is not there.
+    """Also searches where ORB features of similar keyframes put the frame.
 
-    An alignment finds its way over a few centimetres and degrees only; features say how far the
-    frame was taken from a keyframe.
+    Alignment converges only from within a few centimetres and degrees; features measure how far
+    from a keyframe the frame was taken.
     """
 
     saved = (*FernRelocalization.saved, "_images")
@@ -376,7 +376,7 @@ class FeatureRelocalization(FernRelocalization):
     def propose(
         self, frames: Images, lost: Bool, attempts: Int32, aligner: FrameAligner
     ) -> Float64:
-        """From the keyframes' features where their views lead nowhere; see the base class."""
+        """Use the keyframes' features if their views lead nowhere; see the base class."""
         poses = super().propose(frames, lost, attempts, aligner)
         starts = np.full_like(poses, np.nan)
         for env in np.flatnonzero(lost & ~_has_pose(poses)):
@@ -385,7 +385,7 @@ class FeatureRelocalization(FernRelocalization):
         return np.where(_has_pose(poses)[:, None, None], poses, found)
 
     def _by_features(self, env: int, frames: Images, attempt: int) -> Float64:
-        """Pose (4, 4) that most features speak for; NaN: none."""
+        """Pose (4, 4) supported by most features; NaN: none."""
         images, best, pose = self._images[env], FEWEST_MATCHES, np.full((4, 4), np.nan)
         color, depth = frames.of(env)
         near = self.databases[env].candidates(color, depth, _LOOKED_AT)
@@ -427,7 +427,7 @@ def _has_moved(before: Float64, now: Float64) -> Bool:
 def _align(
     aligner: FrameAligner, starts: Float64, hypotheses: Float64, thresholds: NDArray[Any]
 ) -> Alignment:
-    """Align from ``starts`` (B, 4, 4); what comes out where those are NaN means nothing."""
+    """Align from ``starts`` (B, 4, 4); results for NaN starts are meaningless."""
     batch = len(starts)
     origins = np.where(np.isfinite(starts), starts, np.eye(4))
     hypotheses = np.broadcast_to(hypotheses, (batch, NUM_HYPOTHESES, 4, 4))
@@ -435,7 +435,7 @@ def _align(
 
 
 def _spread(candidates: list[Candidate], count: int) -> list[Candidate]:
-    """The first ``count`` that lie apart from all better ones."""
+    """The first ``count`` candidates that are apart from all better ones."""
     chosen: list[Candidate] = []
     for one in candidates:
         if len(chosen) == count:

@@ -1,7 +1,7 @@
-"""Where live frames were taken: pose hypotheses aligned with the map, tried in widening circles.
+"""Localize live frames: align pose hypotheses with the map, in a search that widens step by step.
 
-What is known of the cameras between frames, frames aligned with the views of their maps, and the
-searches for those that are not found near the expected pose.
+Holds the state of the cameras between frames, the alignment of frames with the views of their maps,
+and the searches for frames that are not found near the expected pose.
 """
 
 from __future__ import annotations
@@ -64,10 +64,10 @@ from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 
 class CameraStates(Stateful):
-    """What is known of the cameras of B envs between frames.
+    """State of the cameras of B envs between frames.
 
-    The attributes are for reading: NumPy refuses to write to them. Only the methods change what
-    they show, and only ``BatchedSurfelSlam`` calls those.
+    The attributes are read-only arrays. Only the methods change them, and only
+    ``BatchedSurfelSlam`` calls those.
 
     Attributes:
         poses: (B, 4, 4) T_world_camera.
@@ -77,7 +77,7 @@ class CameraStates(Stateful):
         lost: (B,) frames since tracking was lost.
         time: (B,) frames taken.
         doubted: (B,) frames in a row whose pose is uncertain.
-        usual: (B,) cost and shares of inliers of the alignments that were accepted of late,
+        usual: (B,) running cost and inlier ratios of the alignments accepted recently,
             ``acceptance.USUAL`` each.
         drift: (B, 6, 6) covariances of where the maps about the cameras lie in the world, as
             twists of the cameras.
@@ -168,17 +168,17 @@ class CameraStates(Stateful):
         self._own["poses"][env] = pose
 
     def forget_exposure(self, env: int) -> None:
-        """Take an env's next frame to be exposed like the map; what its noise is stays known."""
+        """Assume that an env's next frame is exposed like the map; keep its noise."""
         noise = self.noise(env)
         self._own["photometry"][env] = same_exposure(1)[0]
         self.expect_noise(env, *noise)
 
     def noise(self, env: int) -> tuple[np.void, float]:
-        """What an env's recording has shown of its noise: ``usual``, and the scale of residuals."""
+        """Noise that an env's recording has shown: ``usual``, and the scale of residuals."""
         return self.usual[env].copy(), float(self.photometry[env]["reference"])
 
     def expect_noise(self, env: int, usual: np.void, reference: float) -> None:
-        """Judge an env's frames by the noise that ``noise`` gave, of whatever map."""
+        """Judge an env's frames by noise that ``noise`` returned, for any map."""
         self._own["usual"][env] = usual
         self._own["photometry"][env]["reference"] = reference
 
@@ -187,7 +187,7 @@ class CameraStates(Stateful):
         self._own["time"] += frames
 
     def set_time(self, env: int, frame: int) -> None:
-        """Give an env's next frame this number."""
+        """Set the index of an env's next frame."""
         self._own["time"][env] = frame
 
     def get_state(self) -> dict[str, Any]:
@@ -216,13 +216,13 @@ class MapAligner:
         self._view_poses: Float64 | None = None  # of ``_view``; None: the maps have changed since
 
     def use(self, pipeline: Pipeline) -> None:
-        """Look at frames in this way from now on."""
+        """Process frames with ``pipeline`` from now on."""
         self._tracker = pipeline.tracker
         self._config = pipeline.config
         self.forget_view()
 
     def forget_view(self) -> None:
-        """Render anew next time: the maps have changed, or what of them takes part."""
+        """Render again next time; call it when the maps or their selected surfels have changed."""
         self._view_poses = None
 
     def render(self, poses: Float64) -> ModelView:
@@ -244,11 +244,11 @@ class MapAligner:
         return self._align(origins, hypotheses, thresholds, self._states.photometry)
 
     def align_strictly(self, origins: Float64, hypotheses: Float64) -> Alignment:
-        """The same under strict thresholds, of alignments that a wide search leads to."""
+        """Align like ``align_from`` under the strict thresholds of a wide search."""
         return self.align_from(origins, hypotheses, self._thresholds(self._strict))
 
     def _thresholds(self, strict: NDArray[np.bool_]) -> NDArray[Any]:
-        """What is demanded (B,) of alignments, ``strict`` (B,) or ordinary."""
+        """Thresholds (B,) for alignments, ``strict`` (B,) or ordinary."""
         return acceptance_thresholds(self._config.acceptance, strict, self._states.lost)
 
     def track(self, invalid: NDArray[np.bool_], guesses: Float64 | None) -> Alignment:
@@ -314,7 +314,7 @@ class MapAligner:
         return self._tracker.align(view, origins, hypotheses, relaxed, guesses, photometry)
 
     def _view_from(self, origins: Float64) -> ModelView:
-        """The maps from ``origins`` (B, 4, 4), but what moves."""
+        """The maps' views from ``origins`` (B, 4, 4), without moving things."""
         view = self.render(origins)
         if self._motion_mask.hide(view, origins):
             self.forget_view()  # it is whole no more
@@ -521,9 +521,9 @@ class Localizer:
     def _appeal(
         self, alignment: Alignment, frames: Images, where: NDArray[np.bool_] | None = None
     ) -> Alignment:
-        """Lay frames that are nearly accepted upon the map's view from where they were found.
+        """Check nearly accepted frames against the map's view from the pose that was found.
 
-        So are those that are accepted after uncertain ones: what follows a wrong pose fits it.
+        Also check accepted frames that follow uncertain ones: a frame after a wrong pose fits it.
         """
         states, acceptance = self._states, self._config.acceptance
         appealed = self._failed(alignment) & np.isin(alignment.status, DISPUTED)
@@ -542,9 +542,9 @@ class Localizer:
     def _status_on_appeal(
         self, env: int, found: AlignmentStatistics, was_refused: bool
     ) -> TrackingStatus:
-        """What becomes of a frame that is laid upon the map's view; doubt does not last for ever.
+        """Status of a frame after that check; a long series of uncertain frames ends in refusal.
 
-        One that the thresholds accept is at worst uncertain.
+        A frame that the thresholds accept is at worst uncertain.
         """
         status = status_on_appeal(found)
         if not was_refused:
@@ -556,8 +556,8 @@ class Localizer:
     def _search_by_features(self, alignment: Alignment, frames: Images) -> Alignment:
         """Align the envs that failed from where features put them.
 
-        A pose that many features all over the image speak for is kept, uncertain, where the map
-        does not bear it out.
+        A pose supported by many features all over the image is kept as uncertain if the map does
+        not confirm it.
         """
         states, found = self._states, {}
         origins = states.poses.copy()
@@ -629,7 +629,7 @@ class Localizer:
 
 
 def _is_refuted(alignment: Alignment, again: Alignment) -> NDArray[np.bool_]:
-    """Whether (B,) the pose is further from that of a part of the frame than this part errs."""
+    """Whether (B,) the pose differs from that of a part of the frame by more than its error."""
     is_worse = alignment.statistics["cost"] > again.statistics["cost"]
     for env in np.flatnonzero(is_worse):
         twist = se3_log(invert(again.T_world_live[env]) @ alignment.T_world_live[env])
@@ -646,7 +646,7 @@ def _is_denied(alignment: Alignment, env: int, pose: Float64, found: FeaturePose
 
 
 def _is_apart(poses: Float64, others: Float64) -> NDArray[np.bool_]:
-    """Which of the poses (B, 4, 4) differ, but not so much that ``others`` tell nothing."""
+    """Which poses (B, 4, 4) differ from ``others`` by more than noise and less than a jump."""
     step, turn = _differences(poses, others)
     is_more = (step > APART_M[0]) | (turn > APART_RAD[0])
     return is_more & (step < APART_M[1]) & (turn < APART_RAD[1])
@@ -663,5 +663,5 @@ def _differences(
 
 
 def _surprise(motions: Float64, expected: Float64) -> NDArray[np.float64]:
-    """Difference (B,) of motions (B, 4, 4), metres or radians, whichever is more."""
+    """Difference (B,) of motions (B, 4, 4): the larger of metres and radians."""
     return np.maximum(*_differences(motions, expected))

@@ -1,19 +1,18 @@
-"""Loop closure by deformation: the map is deformed where its present part meets an older one again.
+"""Loop closure by deformation, where the present part of the map meets an older part again.
 
 ElasticFusion (Whelan et al., RSS 2015, sections IV to VI). Surfels not seen for ``window`` frames
-are inactive: frames are neither tracked against them nor fused into them. Every few frames
+are inactive: frames are neither tracked against them nor fused into them. Every few frames:
 
-- local: where the inactive part is in view, the live frame is aligned with it as it was with
-  the active part before; both poses differ by the drift since;
-- global: where that gave nothing, keyframes that resemble the frame say where else in the inactive
-  part it may be, and it is aligned there.
+- local: if the inactive part is in view, the live frame is aligned with it, as it was with the
+  active part before; the two poses differ by the drift since;
+- global: if that finds nothing, similar keyframes propose other places in the inactive part, and
+  the frame is aligned there.
 
-If the alignment is good, the deformation graph takes the active part there while it holds the
-inactive one, and what is in view becomes one surface, active again. The paper aligns the active
-part's rendering in place of the live frame; the frame has no holes, and its noise is common to
-both poses.
+If the alignment is good, the deformation graph moves the active part there and holds the inactive
+one; the surfels in view become one active surface. The paper aligns the rendering of the active
+part instead of the live frame; the live frame has no holes, and its noise is common to both poses.
 
-A closed loop makes the estimated pose jump by the drift that it takes back.
+Closing a loop makes the estimated pose jump by the drift that it corrects.
 """
 
 from __future__ import annotations
@@ -54,10 +53,10 @@ ClosedLoop = tuple[Loop, Float64]
 
 
 class LoopClosure(Saved):
-    """Recognises places seen before and deforms the maps of B envs so that they meet again.
+    """Recognises places seen before and deforms the maps of B envs so that both passes coincide.
 
-    This is the variant "none": frames are tracked against everything in the map, old and new
-    alike; nothing is deformed, and poses are final when they are returned.
+    This base class is the variant "none": frames are tracked against the whole map, old and new;
+    nothing is deformed, and returned poses are final.
     """
 
     def __init__(self, batch: int) -> None:
@@ -67,44 +66,44 @@ class LoopClosure(Saved):
         """Forget one env."""
 
     def select(self, lost: Int32) -> bool:
-        """Choose what the next frames are tracked against and fused into; whether that changed.
+        """Choose the surfels that the next frames use; return whether the choice has changed.
 
         ``lost`` (B,) counts the frames since tracking was lost; 0 = tracked.
         """
         return False
 
     def record(self, poses: Float64, time: Int32, fused: Bool) -> None:
-        """Take note of the frames ``time`` (B,) at ``poses`` (B, 4, 4) that were ``fused`` (B,)."""
+        """Record the frames ``time`` (B,) at ``poses`` (B, 4, 4), of the envs ``fused`` (B,)."""
 
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
     ) -> Mapping[int, ClosedLoop]:
-        """Look for loops after the frames ``time`` (B,) were recorded; those closed, by env.
+        """Look for loops at the recorded frames ``time`` (B,); return the closed ones by env.
 
-        Maps are corrected in place; ``poses`` (B, 4, 4) stay as they are.
+        Maps are corrected in place; ``poses`` (B, 4, 4) are not changed.
         """
         return {}
 
     def trajectory(self, env: int) -> tuple[Int32, Float64]:
-        """Fused frames (N,) and their poses (N, 4, 4) as the closures since have moved them.
+        """Fused frames (N,) and their poses (N, 4, 4), moved by later loop closures.
 
-        Empty where no trajectory is kept.
+        Empty if no trajectory is kept.
         """
         return np.zeros(0, dtype=np.int32), np.zeros((0, 4, 4))
 
     def get_history(self, env: int) -> TrajectoryHistory:
-        """A copy of what is remembered of one env; empty where nothing is."""
+        """A copy of the history of one env; empty if none is kept."""
         return TrajectoryHistory()
 
     def set_history(self, env: int, history: TrajectoryHistory) -> None:
-        """Remember this of one env."""
+        """Set the history of one env."""
 
 
 LARGEST_SIGMA = 0.01  # standard deviation (metres, radians) of an alignment's worst direction
 LEAST_INLIERS = 0.7  # share of matched points that an alignment explains
-LARGEST_DEG = 20.0  # correction of the camera's rotation that is believed
+LARGEST_DEG = 20.0  # largest accepted correction of the camera's rotation
 LARGEST_DISSIMILARITY = 0.3  # of a frame and a keyframe of the same place, share of the ferns
-AGREEMENT_M = 0.01  # a loop is closed when two looks agree so far on the correction, at 1 m
+AGREEMENT_M = 0.01  # two looks must agree on the correction to within this, at 1 m
 SETTLED = 0.02, np.radians(2.0)  # largest motion of a repeated alignment
 
 
@@ -124,13 +123,13 @@ class InactiveAligner:
         self._poses = SavedBuffer(self.batch, wp.mat44, device)
 
     def set_frame(self, live: LiveFrame) -> None:
-        """Take the frames that are aligned next."""
+        """Set the frames to align next."""
         self._tracker.set_frame(live)
 
     def covered(self, poses: Float64, due: Bool) -> Bool:
-        """Which of the envs that are ``due`` (B,) see enough of the inactive part from ``poses``.
+        """Which envs (B,) among ``due`` (B,) see enough of the inactive part from ``poses``.
 
-        The view of it is at hand then.
+        Renders the view of it for these envs.
         """
         self._poses.write(poses)
         self._inactive.cull(self._poses.array)
@@ -148,9 +147,9 @@ class InactiveAligner:
         return self._align(poses, tracking_hypotheses(np.eye(4)), self.config.largest_m)
 
     def from_keyframes(self, starts: Float64) -> Alignment | None:
-        """Align from poses (B, 4, 4) that are rough and may be wrong, NaN for an env without.
+        """Align from rough and possibly wrong poses (B, 4, 4), NaN for an env without one.
 
-        What is found must be found again from there; None if nothing was.
+        A result counts only if a second alignment from there confirms it; None if there is none.
         """
         given = np.isfinite(starts[:, 0, 0])
         origins = np.where(given[:, None, None], starts, np.eye(4))
@@ -180,7 +179,7 @@ class InactiveAligner:
         return self._tracker.align(self._inactive.view, origins, stack, thresholds)
 
 
-SIGNIFICANT = 3.0  # drift, in standard deviations of the alignment, that is worth deforming for
+SIGNIFICANT = 3.0  # least drift to deform for, in standard deviations of the alignment
 VIEW_APART_M, VIEW_APART_RAD = 1.0, np.radians(60.0)  # views of one place differ by less
 
 
@@ -207,7 +206,7 @@ class DeformationLoopClosure(LoopClosure):
         self._histories[env] = TrajectoryHistory()
 
     def select(self, lost: Int32) -> bool:
-        """The active surfels, or all while tracking is lost."""
+        """Use the active surfels, or all of them while tracking is lost; see the base class."""
         last = np.array([history.last for history in self._histories])
         seen_from = np.where(lost > 0, EARLIEST, last - self.config.window).astype(np.int32)
         changed = not np.array_equal(seen_from, self._seen_from)
@@ -224,7 +223,7 @@ class DeformationLoopClosure(LoopClosure):
     def close(
         self, live: LiveFrame, poses: Float64, time: Int32, tracked: Bool, similar: SimilarViews
     ) -> Mapping[int, ClosedLoop]:
-        """Look for loops where it is time to, and close them; see the base class."""
+        """Look for loops in the envs that are due, and close them; see the base class."""
         found: dict[int, ClosedLoop | None] = {}
         due = tracked & (time > self.config.window) & (time % self.config.interval == 0)
         if not due.any():
@@ -245,7 +244,7 @@ class DeformationLoopClosure(LoopClosure):
     def _close_from_keyframes(
         self, env: int, poses: Float64, similar: SimilarViews
     ) -> ClosedLoop | None:
-        """Look for the frame where similar ones were taken, and close a loop there."""
+        """Look for the frame at similar keyframes, and close a loop there."""
         history = self._histories[env]
         for candidate in similar(env, history.last - self.config.window):
             if candidate.dissimilarity > LARGEST_DISSIMILARITY:
@@ -265,7 +264,7 @@ class DeformationLoopClosure(LoopClosure):
         return None
 
     def _close(self, env: int, poses: Float64, there: Alignment) -> ClosedLoop | None:
-        """Deform map and history of one env; the loop and where the camera is, if accepted."""
+        """Deform map and history of one env; return loop and camera pose, or None if refused."""
         history, corrected = self._histories[env], there.T_world_live[env]
         loop = history.loop_at(corrected, history.last - self.config.window)
         drift = motion_size(invert(poses[env]) @ corrected)
@@ -289,13 +288,13 @@ class DeformationLoopClosure(LoopClosure):
         return self._histories[env].trajectory()
 
     def get_history(self, env: int) -> TrajectoryHistory:
-        """A copy of what is remembered of one env."""
+        """A copy of the history of one env."""
         copied = TrajectoryHistory()
         copied.set_state(self._histories[env].get_state())
         return copied
 
     def set_history(self, env: int, history: TrajectoryHistory) -> None:
-        """Remember this of one env."""
+        """Set the history of one env."""
         self._histories[env] = history
 
 

@@ -1,26 +1,26 @@
-"""Deforms the map of one env so that its present part meets the inactive one; joins them.
+"""Deform the map of one env so that its present part meets the inactive one, and join them.
 
 The motion of space is an embedded deformation graph: Sumner, Schmid and Pauly, "Embedded
 deformation for shape manipulation" (SIGGRAPH 2007), as used by ElasticFusion (Whelan et al., RSS
-2015, section V): nodes are sampled uniformly along the order in which surfels were created, and
-each is joined to its neighbours in that order. So two passes through one place hang together along
-the way between them only, and can be pulled apart or onto each other there. The energy (section
-V-B) is minimised by sparse Gauss-Newton:
+2015, section V). Nodes are sampled uniformly in the order in which surfels were created, and each
+is joined to its neighbours in that order. So two passes through one place are connected only along
+the path between them, and can be pulled onto each other. The energy (section V-B) is minimised by
+sparse Gauss-Newton:
 
     E_rot = sum_l |R_l^T R_l - I|^2                                                  equation 10
     E_reg = sum_l sum_n |R_l (g_n - g_l) + g_l + t_l - (g_n + t_n)|^2                equation 11
     E_con = sum_p |phi(source_p) - target_p|^2                                       equation 12
 
 Pins are constraints whose target is their source; a relative constraint has phi(target_p) in place
-of target_p (equation 14). One term is added to the paper's:
+of target_p (equation 14). We add one term:
 
     E_twist = TWIST_M^2 sum_l sum_n |R_l - R_n|^2                     weighted like E_reg
 
-The k nodes next in time often lie along a line, about which E_reg lets R turn freely; long chains
-of nodes then fold up to make a gap of centimetres good. E_twist is E_reg for points TWIST_M beside
-the nodes.
+The k nodes nearest in time often lie along a line, about which E_reg lets R turn freely; long
+chains of nodes then fold up to close a gap of centimetres. E_twist is E_reg for points TWIST_M
+beside the nodes.
 
-All but E_rot is linear in the unknowns, which are for every node the nine numbers of R row by row,
+All terms but E_rot are linear in the unknowns: for every node the nine numbers of R row by row,
 then t.
 """
 
@@ -52,14 +52,14 @@ from ms_slam_env.slam.surfel.surfels import (
     floor_int,
 )
 
-NEIGHBOURS = 4  # k: of a node, and nodes that influence a point
-TEMPORAL_WINDOW = 20  # nodes nearest in time among which a point's nearest ones are looked for
+NEIGHBOURS = 4  # k: neighbours of a node, and nodes that influence a point
+TEMPORAL_WINDOW = 20  # a point's nearest nodes are sought among this many nearest in time
 FEWEST_NODES = NEIGHBOURS + 2
 
 
 @dataclass(frozen=True)
 class DeformationGraph:
-    """Nodes in the order of time, each joined to its neighbours in that order."""
+    """Nodes in temporal order, each joined to its neighbours in that order."""
 
     positions: Float64  # (M, 3) g of the nodes, metres
     times: Float64  # (M,) when their surfels were created, ascending; any unit
@@ -68,7 +68,7 @@ class DeformationGraph:
         return len(self.positions)
 
     def edges(self) -> Int64:
-        """Directed edges (E, 2) from every node to the k nearest in the order of time."""
+        """Directed edges (E, 2) from every node to the k nearest in temporal order."""
         count = len(self)
         half = NEIGHBOURS // 2
         first = np.clip(np.arange(count) - half, 0, count - 1 - NEIGHBOURS)
@@ -77,7 +77,7 @@ class DeformationGraph:
         return np.stack([own, near], axis=-1)[near != own].astype(np.int64)
 
     def first_candidates(self, times: ArrayLike) -> Int64:
-        """First node (N,) of the run of ``window`` nodes nearest in time to every point."""
+        """First (N,) of the ``window`` consecutive nodes nearest in time to every point."""
         times = np.asarray(times, dtype=np.float64)
         after = np.searchsorted(self.times, times).clip(1, len(self) - 1)
         closer = times - self.times[after - 1] <= self.times[after] - times
@@ -86,18 +86,19 @@ class DeformationGraph:
 
     @property
     def window(self) -> int:
-        """Number of nodes among which the nearest ones of a point are looked for."""
+        """Number of nodes among which the nearest ones of a point are sought."""
         return min(TEMPORAL_WINDOW, len(self))
 
     def influence(self, points: ArrayLike, times: ArrayLike) -> tuple[Int64, Float64]:
         """Nodes (N, k) that move each point, and their weights (N, k), which sum to one.
 
-        The k nearest of the nodes near in time, with (1 - distance / farthest)^2, where farthest
-        is the distance of the next nearest one (ElasticFusion, algorithm 1 and equation 9).
+        These are the k nearest of the nodes near in time. Their weight is (1 - distance /
+        farthest)^2, where farthest is the distance of the next nearest node (ElasticFusion,
+        algorithm 1 and equation 9).
 
         Args:
             points: (N, 3).
-            times: (N,) when each was created.
+            times: (N,) creation time of each.
         """
         points = np.asarray(points, dtype=np.float64)
         candidates = self.first_candidates(times)[:, None] + np.arange(self.window)
@@ -105,14 +106,14 @@ class DeformationGraph:
         order = np.argsort(distances, axis=1, kind="stable")[:, : NEIGHBOURS + 1]
         nearest = np.take_along_axis(distances, order, axis=1)
         farthest = np.maximum(nearest[:, -1:], 1e-12)
-        # A little of everything, so that equal distances do not all weigh nothing.
+        # A small constant keeps weights positive when all distances are equal.
         weights = (1.0 - nearest[:, :-1] / farthest) ** 2 + 1e-6
         nodes = np.take_along_axis(candidates, order[:, :-1], axis=1)
         return nodes, weights / weights.sum(axis=1, keepdims=True)
 
 
 def sample_graph(positions: ArrayLike, times: ArrayLike, count: int) -> DeformationGraph:
-    """Graph of ``count`` of the points (N, 3), evenly spaced along their ascending times (N,)."""
+    """Graph of ``count`` of the points (N, 3), evenly spaced in order of ascending times (N,)."""
     points = np.asarray(positions, dtype=np.float64)
     count = max(FEWEST_NODES, min(count, len(points)))
     chosen = np.linspace(0, len(points) - 1, count).round().astype(np.int64)
@@ -128,7 +129,7 @@ class Deformation:
     t: Float64  # (M, 3) translation of each, metres
 
     def points(self, points: ArrayLike, times: ArrayLike) -> Float64:
-        """Where points (N, 3) of times (N,) go: ElasticFusion, equation 8."""
+        """Points (N, 3), created at times (N,), after deformation: ElasticFusion, equation 8."""
         points = np.asarray(points, dtype=np.float64)
         nodes, weights = self.graph.influence(points, times)
         centres = self.graph.positions[nodes]
@@ -146,7 +147,7 @@ def identity(graph: DeformationGraph) -> Deformation:
 UNKNOWNS = 12  # of a node
 W_ROT, W_REG, W_CON = 1.0, 10.0, 100.0
 TWIST_M = 0.3
-DAMPING = 1e-9  # share of the mean diagonal, for what the constraints leave free
+DAMPING = 1e-9  # share of the mean diagonal, for directions that the constraints leave free
 SMALLEST_STEP = 1e-7
 _ROWS, _COLUMNS = np.triu_indices(3)
 _DOUBLED = np.where(_ROWS == _COLUMNS, 1.0, np.sqrt(2.0))  # R^T R is symmetric
@@ -154,22 +155,22 @@ _DOUBLED = np.where(_ROWS == _COLUMNS, 1.0, np.sqrt(2.0))  # R^T R is symmetric
 
 @dataclass(frozen=True)
 class Constraints(Rows):
-    """Points of the map and where they should go."""
+    """Points of the map and their targets."""
 
     sources: Float64  # (C, 3) points
-    source_times: Float64  # (C,) when they were created
+    source_times: Float64  # (C,) their creation times
     targets: Float64  # (C, 3) where they belong
-    # (C,) when the surface at the target was created; NaN: the target is fixed, otherwise it moves
-    # with the deformation.
+    # (C,) creation time of the surface at the target, which moves with the deformation; NaN: the
+    # target is fixed.
     target_times: Float64
 
     def errors(self, deformation: Deformation) -> Float64:
-        """Distances (C,) that remain, metres."""
+        """Remaining distances (C,) to the targets, metres."""
         moved = self.moved_by(deformation)
         return np.linalg.norm(moved.sources - moved.targets, axis=1)
 
     def moved_by(self, deformation: Deformation) -> Constraints:
-        """The same after a deformation of the map; fixed targets stay."""
+        """A copy moved by a deformation of the map; fixed targets stay."""
         relative = np.isfinite(self.target_times)
         targets = self.targets.copy()
         targets[relative] = deformation.points(targets[relative], self.target_times[relative])
@@ -178,7 +179,7 @@ class Constraints(Rows):
 
 
 def no_constraints() -> Constraints:
-    """An empty set."""
+    """An empty set of constraints."""
     return Constraints(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
 
 
@@ -238,7 +239,7 @@ class Energy:
 def optimise(
     graph: DeformationGraph, constraints: Constraints, iterations: int = 10
 ) -> Deformation:
-    """The deformation of least energy, by Gauss-Newton from rest."""
+    """The deformation of least energy, by Gauss-Newton from the identity."""
     if not len(constraints):
         return identity(graph)
     energy = Energy(graph, constraints)
@@ -252,13 +253,13 @@ def optimise(
 
 
 def pack(deformation: Deformation) -> Float64:
-    """The unknowns (12 M,) of a deformation."""
+    """Flatten a deformation into its unknowns (12 M,)."""
     count = len(deformation.graph)
     return np.concatenate([deformation.R.reshape(count, 9), deformation.t], axis=1).ravel()
 
 
 def unpack(graph: DeformationGraph, x: Float64) -> Deformation:
-    """The deformation of unknowns (12 M,)."""
+    """Rebuild a deformation from its unknowns (12 M,)."""
     nodes = x.reshape(len(graph), UNKNOWNS)
     return Deformation(graph, nodes[:, :9].reshape(-1, 3, 3).copy(), nodes[:, 9:].copy())
 
@@ -333,13 +334,13 @@ def _rows(values: Float64, columns: NDArray[np.int64], nodes: int) -> sparse.csr
 FEWEST_CONSTRAINTS = 12
 SURFELS_PER_NODE, MAX_NODES = 400, 100
 CONSTRAINT_COLUMNS = 16
-"""The image is divided into so many columns, with rows as high as they are wide.
+"""Number of columns into which the image is divided; its cells are square.
 
 Each cell gives one constraint and one pin.
 """
-ERROR_M = 0.01  # largest RMS distance that the constraints may keep after the graph was optimised
-ERROR_SHARE = 0.3  # the same as a share of the distance before
-NEAREST = wp.constant(5)  # NEIGHBOURS that move a point, and the next one
+ERROR_M = 0.01  # largest RMS distance of the constraints after optimisation
+ERROR_SHARE = 0.3  # largest share of the distance before optimisation
+NEAREST = wp.constant(5)  # the NEIGHBOURS that move a point, and the next nearest one
 
 
 @dataclass(frozen=True)
@@ -348,15 +349,15 @@ class VisiblePoints(Rows):
 
     camera: Float64  # (N, 3) positions in the camera's frame
     world: Float64  # (N, 3) positions in the world
-    times: Float64  # (N,) when they were created, see ``creation_times``
+    times: Float64  # (N,) creation times, see ``creation_times``
 
 
 def creation_times(created: NDArray[np.int32]) -> tuple[Int64, Float64]:
     """Order (N,) of surfels by creation, and their times (N,) in frames, in that order.
 
-    Surfels of one frame are spread over it evenly in the order of their slots, which is that of
-    the image's rows: neighbours in time are then neighbours in space too, and the first frame,
-    which makes a third of a small map, has as many nodes of the graph as it deserves.
+    Surfels of one frame get evenly spaced times within that frame, in the order of their slots,
+    which is the order of image rows. So neighbours in time are also neighbours in space, and the
+    first frame, a third of a small map, gets its share of the graph's nodes.
     """
     order = np.argsort(created, kind="stable")
     ordered = created[order]
@@ -374,14 +375,14 @@ def choose_points(
     columns: int,
     tolerance_m: float,
 ) -> Int64:
-    """One surfel (M,) for each cell of the image, the nearest to its middle.
+    """Indices (M,) of one surfel for each cell of the image, the nearest to its centre.
 
     Args:
         points: surfels in sight.
         intrinsics: of ``depth``.
-        depth: (H, W) metres of the surface that they must lie on; 0 = leave such pixels out.
+        depth: (H, W) metres, the surface on which the surfels must lie; 0 = ignore the pixel.
         columns: number of cells side by side.
-        tolerance_m: how far from the surface, at 1 m; grows with depth squared.
+        tolerance_m: largest distance from the surface, at 1 m; grows with depth squared.
     """
     z = points.camera[:, 2]
     place = intrinsics.project(points.camera)
@@ -402,7 +403,7 @@ def choose_points(
 def surface_constraints(
     active: VisiblePoints, inactive: VisiblePoints, correction: Float64
 ) -> Constraints:
-    """Move points of the active part by ``correction`` (4, 4), hold those of the inactive part."""
+    """Constrain active points to move by ``correction`` (4, 4), and pin inactive ones."""
     targets = transform_points(correction, active.world)
     moves = Constraints(active.world, active.times, targets, np.full(len(targets), np.nan))
     pins = np.full(len(inactive.world), np.nan)
@@ -412,9 +413,9 @@ def surface_constraints(
 def relative_to(
     constraints: Constraints, active: VisiblePoints, inactive: VisiblePoints
 ) -> Constraints:
-    """The moves among ``surface_constraints`` as relative ones, which later loops must respect.
+    """The moves of ``surface_constraints`` as relative ones, which later loops must respect.
 
-    A target is as old as the nearest pin.
+    The creation time of a target is that of the nearest pin.
     """
     count = len(active.world)
     targets = constraints.targets[:count]
@@ -441,8 +442,8 @@ def deform_surfels(
 ) -> None:
     """Move position and normal of every surfel of env b: ``Deformation.points`` in float32.
 
-    The normal turns with the blend of R, which is close to a rotation; the paper's inverse
-    transpose of R is the same for a rotation.
+    The normal turns with the blend of R. The paper uses the inverse transpose of R, which is the
+    same for a rotation, and R is close to one.
     """
     i = wp.tid()
     p = surfels.position[b, i]
@@ -491,7 +492,7 @@ def pixel_of(p: wp.vec3, camera: SplatCamera) -> wp.vec2i:
 
 @wp.kernel
 def reactivate(surfels: Surfels, b: int, seen_from: int, seen_to: int, now: int) -> None:
-    """Count the surfels of env b that were last seen within these frames as seen now."""
+    """Mark the surfels of env b last seen within these frames as seen now."""
     i = wp.tid()
     seen = surfels.seen[b, i]
     if seen >= seen_from and seen <= seen_to:
@@ -509,7 +510,7 @@ def merge(
     min_cosine: float,
     stable: float,  # confidence
 ) -> None:
-    """Remove the unstable active surfels of env b that lie on a surface mapped before."""
+    """Remove the unstable active surfels of env b that lie on a previously mapped surface."""
     j = wp.tid()
     p = visible.position[b, j]
     pixel = pixel_of(p, camera)
@@ -546,17 +547,17 @@ class MapDeformer:
     def deform(
         self, env: int, pose: Float64, corrected: Float64, earlier: Constraints
     ) -> tuple[Deformation, Constraints] | None:
-        """Take what is seen from ``pose`` to where it is seen from ``corrected``, if acceptable.
+        """Deform a map so that surfels seen from ``pose`` come to be seen from ``corrected``.
 
         Args:
-            env: whose map.
-            pose: (4, 4) of the camera in the active part.
-            corrected: (4, 4) the same in the inactive part.
+            env: index of the map.
+            pose: (4, 4) camera pose relative to the active part.
+            corrected: (4, 4) camera pose relative to the inactive part.
             earlier: relative constraints of the loops closed before.
 
         Returns:
-            The deformation done, and the relative constraints of this loop, at their new places;
-            None if the map is as it was.
+            The deformation, and the relative constraints of this loop after it; None, with the map
+            unchanged, if there are too few points or the result is not acceptable.
         """
         used = int(self.map.surfels.count.numpy()[env])
         if used < FEWEST_NODES:
@@ -582,7 +583,7 @@ class MapDeformer:
         return deformation, relative_to(surface, new, old).moved_by(deformation)
 
     def _is_acceptable(self, constraints: Constraints, deformation: Deformation) -> bool:
-        """Whether the graph could do what the constraints ask."""
+        """Whether the deformation meets the constraints closely enough."""
         before = _rms(constraints.errors(identity(deformation.graph)))
         after = _rms(constraints.errors(deformation))
         allowed = max(self.config.smallest_m, ERROR_SHARE * before)
@@ -591,7 +592,7 @@ class MapDeformer:
     def _look(
         self, renderer: SplatRenderer, env: int, pose: Float64, times: Float64
     ) -> tuple[VisiblePoints, NDArray[np.float32]]:
-        """The surfels of one env that a renderer shows, in order of slots, and its depth image."""
+        """Surfels of one env that a renderer shows, ordered by slot, and its depth image."""
         self._cull(renderer, pose)
         depth = renderer.splat().vertices.numpy()[env, ..., 2].copy()
         index = np.sort(self._visible(renderer, env))
@@ -604,12 +605,12 @@ class MapDeformer:
         renderer.cull(self._poses.array)
 
     def _visible(self, renderer: SplatRenderer, env: int) -> NDArray[np.int32]:
-        """Slots of the surfels that the last cull listed."""
+        """Slots of the surfels listed by the last cull."""
         count = int(renderer.visible.count.numpy()[env])
         return renderer.visible.index[env, :count].numpy() if count else np.zeros(0, np.int32)
 
     def _choose(self, points: VisiblePoints, depth: NDArray[np.float32]) -> Int64:
-        """Some of the points on a surface, spread over the image."""
+        """Indices of points on a surface, spread over the image."""
         intrinsics, tolerance_m = self._inactive.intrinsics, self._tolerance_m
         return choose_points(points, intrinsics, depth, CONSTRAINT_COLUMNS, tolerance_m)
 
@@ -630,9 +631,10 @@ class MapDeformer:
         wp.launch(kernel, dim=count, inputs=inputs, device=self.device)
 
     def join_parts(self, env: int, pose: Float64, now: int) -> None:
-        """Make one surface of both parts in view from ``pose`` (4, 4), and the old one active.
+        """Merge both parts in view from ``pose`` (4, 4), and make the old one active.
 
-        Surfels seen about the same time as those in view come along: they hang together.
+        Surfels last seen at about the same time as those in view become active with them, because
+        they belong to the same part.
         """
         self._cull(self._inactive, pose)
         view = self._inactive.splat()

@@ -13,34 +13,34 @@ With the right perturbation T <- T exp(xi), xi = (rho, phi):
     d r_icp / d xi = (n_q, v x n_q)
     d r_rgb / d xi = -(g, q x g)       g = grad I_live . d pi / d q
 
-Residuals are divided by their standard deviations, which makes both terms free of units:
+Residuals are divided by their standard deviations, so both terms are dimensionless:
 
     s_icp = depth_noise_m z^2                        axial noise of the sensor
     s_rgb^2 = intensity_noise^2 + (LATERAL_NOISE_PX |grad I|)^2
 
-The second part of s_rgb is the error of the place in the image where the grey value was sampled
-(aliasing, depth, pose of the map). Without it strong edges, the best features, look like outliers.
-The cost is, with w = icp_rgb_weight,
+The second part of s_rgb is the position error of the sampled grey value in the image (aliasing,
+depth, pose of the map). Without it strong edges, the best features, look like outliers. The cost,
+with w = icp_rgb_weight, is
 
     E = (1 - w) / 50 sum rho(r_icp / s_icp) + w sum rho(r_rgb / s_rgb)
 
 where rho(r) = c^2/2 log(1 + (r/c)^2) is Cauchy's loss: w = 0 is geometry alone, w = 1 photometry
-alone. Errors of neighbouring depths are alike (filter, quantisation, map), those of grey values
-are not: 50 depths count as one independent reading. The number was chosen so that the default
-w = 0.1 is about the best on noisy sequences.
+alone. Errors of neighbouring depths are correlated (filter, quantisation, map), those of grey
+values are not, so 50 depths count as one independent reading. The number was chosen so that the
+default w = 0.1 is about the best on noisy sequences.
 
-Gain and bias follow the camera's exposure: each step solves for them too, from points weighted by
-rho's weights over s_rgb^2, so that flat regions decide, which misalignment leaves alone. The gain
-moves only as far as the data ask: regression of the live on the model's values gives too small a
-gain, that of the model's on the live values too large a one, where either is noisy or misaligned.
-(A gain that follows the first would shrink from frame to frame, since the map is made of colours
-that are freed from it.) The photometric c is the maximum-likelihood scale of Cauchy's
+Gain and bias follow the camera's exposure. Each step also solves for them, from points weighted by
+rho's weights over s_rgb^2, so that flat regions decide; misalignment hardly affects these. The gain
+moves only as far as the data require: with noise or misalignment, regression of live values on the
+model's gives too small a gain, and regression of the model's on live values too large a one. (A
+gain that followed the first would shrink from frame to frame, because colours are divided by it
+before they enter the map.) The photometric c is the maximum-likelihood scale of Cauchy's
 distribution, where the mean weight is 1/2, but at least ``cauchy_rgb``. The term is divided by
-(c / least c)^2: images that are blurred or badly registered count less. ``Photometry.trust`` is
-one more factor.
+(c / least c)^2, so blurred or badly registered images count less. ``Photometry.trust`` is one more
+factor.
 
-On the CPU the work is done for many points at once, by short loops over local arrays, which the
-compiler turns into operations on eight points. A thread of a GPU takes one point at a time.
+On the CPU, short loops over local arrays process many points at once; the compiler vectorizes them
+over eight points. A GPU thread takes one point at a time.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ from ms_slam_env.native import native_source
 
 
 class Sum(IntEnum):
-    """Places of a pass's sums; H takes 21 (upper triangle by rows), g = J^T W r six."""
+    """Indices of a pass's sums; H takes 21 (upper triangle by rows), g = J^T W r takes six."""
 
     GEOMETRIC_HESSIAN = 0
     GEOMETRIC_GRADIENT = 21
     COST = 27  # truncated robust cost of the visible points, in [0, 3] each
-    POINTS = 28  # model points looked at
+    POINTS = 28  # model points sampled
     VISIBLE = 29  # of those, inside the live image
     MATCHED = 30  # of those, with a live vertex
     INLIERS = 31  # of those, within the gates and a few sigmas of the model's plane
@@ -94,7 +94,7 @@ class Weights:
     per_cauchy_icp: float  # 1 / sigmas
     per_cauchy_rgb: float  # 1 / sigmas
     grey_variance: float  # of the intensity, grey levels^2
-    pixel_variance: float  # of the place in the image, pixels^2
+    pixel_variance: float  # of the position in the image, pixels^2
     distance_m: float
     cos_angle: float
     inlier_sigmas: float  # these four as in ``AcceptanceConfig``
@@ -106,12 +106,12 @@ class Weights:
 
 @wp.struct
 class Photometry:
-    """How the live grey values relate to the model's: I_live ~ gain I_model + bias."""
+    """Relation of the live grey values to the model's: I_live ~ gain I_model + bias."""
 
     gain: float
     bias: float  # grey levels
     scale: float  # c of the photometric loss, in sigmas: half of all textured residuals exceed it
-    reference: float  # the same as it usually is, over its least value; the unit of the acceptance
+    reference: float  # usual scale over its least value; the unit of the acceptance thresholds
     trust: float  # weight of the photometric term, [0, 1]
 
 

@@ -1,8 +1,8 @@
-"""How a live image's grey values relate to the map's: exposure, scale of residuals, trust.
+"""Relation of a live image's grey values to the map's: exposure, scale of residuals, trust.
 
-All of it is estimated while tracking, see ``normal_equations`` and ``solver``, and carried from
-frame to frame here. Invalid frames are found here too: black and blank ones, from a shutter, a
-dropped frame, glare, have nothing to track in them.
+Tracking estimates them, see ``normal_equations`` and ``solver``; this module carries them from
+frame to frame. It also detects invalid frames: black or blank ones, from a shutter, a dropped frame
+or glare, which hold nothing to track.
 """
 
 from __future__ import annotations
@@ -30,21 +30,25 @@ from ms_slam_env.slam.surfel.normal_equations import Photometry
 from ms_slam_env.slam.surfel.preprocessing import BAD_DEPTH, LiveFrame
 
 DTYPE: np.dtype[Any] = Photometry.numpy_dtype()  # type: ignore[attr-defined]
-SMALL_GAIN = 0.04  # a gain and a bias this near to none are left alone: a systematic error of
-SMALL_BIAS = 4.0  # theirs, applied frame after frame, would bleach or darken the map
+# A gain this close to 1 and a bias this close to 0 are not corrected: their systematic error,
+# applied frame after frame, would bleach or darken the map.
+SMALL_GAIN = 0.04
+SMALL_BIAS = 4.0
 MIDDLE_GREY = 128.0  # about which gain and bias are nearly independent
 LARGEST_CONFLICT = 1.0  # 95 % of the frames of registered images have less
-TRUST_FALLS = 0.2  # by this factor a frame at most
-TRUST_GROWS = 1.15
+TRUST_FALLS = 0.2  # smallest factor per frame
+TRUST_GROWS = 1.15  # factor per frame
 LEAST_TRUST = 1.0e-4
 USUAL_SCALE = 1.4  # a frame's residuals may have 1.4 times the scale estimated for the last ones
-SCALE_FALLS = 0.1  # share of the way to a smaller scale, a frame
-LEAP = 1.3  # times that of the frames before
-TRUSTED = 0.1
-_EVERY = 4  # rows and columns that are looked at
+SCALE_FALLS = 0.1  # share of the way to a smaller scale, per frame
+LEAP = 1.3  # ratio to the scale of the frames before
+TRUSTED = 0.1  # trust above which grey values counted
+_EVERY = 4  # every n-th row and column is sampled
 _CONSTANT = 0.5  # largest standard deviation of an image that no sensor took, grey levels
-_DARK, _BRIGHT = 16.0, 240.0  # means below and above which an image
-_FAINT = 4.0  # of at most this standard deviation is black or glare
+# An image darker or brighter than these means, with at most this standard deviation, is black or
+# glare; grey levels.
+_DARK, _BRIGHT = 16.0, 240.0
+_FAINT = 4.0
 
 
 def same_exposure(batch: int) -> NDArray[Any]:
@@ -56,7 +60,7 @@ def same_exposure(batch: int) -> NDArray[Any]:
 
 
 def geometry_only(photometry: NDArray[Any]) -> NDArray[Any]:
-    """The same (B,) for an alignment by geometry alone."""
+    """A copy (B,) without trust in grey values, for an alignment by geometry alone."""
     blind = photometry.copy()
     blind["trust"] = 0.0
     return blind
@@ -90,21 +94,21 @@ def at_least(least: float, values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def is_leap(before: NDArray[Any], frame: NDArray[Any], least_scale: float) -> Bool:
-    """Which envs' (B,) grey values, trusted before, all at once fit worse or not at all."""
+    """Envs (B,) whose grey values, trusted before, suddenly fit worse or not at all."""
     share = USUAL_SCALE * frame["scale"] / least_scale
     is_blind = (frame["trust"] == 0.0) & (before["trust"] > TRUSTED)
     return (share > LEAP * before["reference"]) | is_blind
 
 
 def correction(photometry: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gain (B,) and bias (B,) that colours are freed from; exactly 1 and 0 if they are small."""
+    """Gain (B,) and bias (B,) to remove from colours; exactly 1 and 0 if they are small."""
     gain = np.exp(_shrink(np.log(photometry["gain"].astype(np.float64)), SMALL_GAIN))
     shift = photometry["bias"] + MIDDLE_GREY * (photometry["gain"].astype(np.float64) - 1.0)
     return gain, _shrink(shift, SMALL_BIAS) - MIDDLE_GREY * (gain - 1.0)
 
 
 def _shrink(values: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
-    """Soft thresholding: nearer to zero by ``threshold``, and continuous."""
+    """Soft thresholding: move values towards zero by ``threshold``."""
     return np.sign(values) * np.maximum(np.abs(values) - threshold, 0.0)
 
 
@@ -117,7 +121,7 @@ def _correct(
     columns: wp.int32,  # per thread
     color: wp.array[wp.vec3],
 ) -> None:
-    """(colour - bias) / gain, in [0, 255]."""
+    """Replace colour by (colour - bias) / gain, clamped to [0, 255]."""
     row, piece = wp.tid()
     b = row / height
     scale = per_gain[b]
@@ -134,7 +138,7 @@ def _correct(
 
 
 class ExposureCorrection:
-    """Brings the live colours back to the map's exposure, so that fusing them leaves no stripes."""
+    """Corrects the live colours to the map's exposure, so that fusion leaves no stripes."""
 
     def __init__(self, batch: int, intrinsics: Intrinsics, device: str) -> None:
         self._size = intrinsics.shape
@@ -157,9 +161,9 @@ class ExposureCorrection:
 
 
 def is_invalid_frame(color: NDArray[np.uint8]) -> Bool:
-    """Which images (B, H, W, 3) show nothing: one colour throughout, or black, or glare.
+    """Which images (B, H, W, 3) show nothing: one colour throughout, black, or glare.
 
-    A plain wall is neither: its image has the sensor's noise and a middling brightness.
+    An image of a plain wall is valid: it has the sensor's noise and a medium brightness.
     """
     # Image by image OpenCV takes a tenth of the time of NumPy's sums over the whole batch.
     sampled = np.ascontiguousarray(color[:, ::_EVERY, ::_EVERY])
@@ -175,7 +179,7 @@ def _shows_nothing(mean: NDArray[np.float64], deviation: NDArray[np.float64]) ->
 
 
 class InvalidFrameDetector(Saved):
-    """Tells the blank frames of B envs, where frames are not always so.
+    """Detects blank frames of B envs, in recordings that have colour.
 
     Recordings without colour have blank images from the first frame on.
     """

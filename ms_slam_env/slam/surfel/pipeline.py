@@ -1,7 +1,6 @@
-"""What of a surfel SLAM depends on its configuration and the size of its frames, but not the map.
+"""The parts of a surfel SLAM that depend on its configuration and frame size, but not on the map.
 
-A running SLAM may change to another pipeline: it goes on with the same surfels, poses and
-keyframes.
+A running SLAM may switch to another pipeline and keep its surfels, poses and keyframes.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ FIXED = (
     *("max_surfels", "acceptance", "relocalisation", "loop_closure", "loops", "submaps"),
     *("motion_mask", "readout_s", "color_registration"),
 )
-"""Fields of ``SurfelConfig`` that a running SLAM keeps: they shape what it has stored, or what its
-parts were made with."""
-_KEPT = 8  # pipelines: each has the buffers of its images
+"""Fields of ``SurfelConfig`` that a running SLAM cannot change: stored data or existing parts
+depend on them."""
+_KEPT = 8  # pipelines kept; each has its own image buffers
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Pipeline:
 
 
 class PipelineCache:
-    """Pipelines of one map, made when they are first asked for and kept for the next time."""
+    """Pipelines of one map, made at the first request and kept for the next."""
 
     def __init__(self, surfel_map: SurfelMap) -> None:
         self._map = surfel_map
@@ -73,10 +72,10 @@ class PipelineCache:
 
 
 def check_change(before: SurfelConfig, after: SurfelConfig, is_resized: bool) -> None:
-    """Refuse a change of what a running SLAM must keep.
+    """Refuse a change that a running SLAM cannot make.
 
     Raises:
-        InputError: naming it.
+        InputError: a field of ``FIXED`` changes, or the image size with loop closure; names it.
     """
     for name in FIXED:
         old, new = getattr(before, name), getattr(after, name)

@@ -1,4 +1,4 @@
-"""Pose hypotheses of tracking and relocalization: where they start, and which one goes on.
+"""Pose hypotheses of tracking and relocalization: how they start, and which one is selected.
 
 They are motions T_model_live, relative to the pose of the model view.
 """
@@ -18,10 +18,10 @@ from ms_slam_env.slam.surfel.normal_equations import OFF, RUNNING, Hypotheses, S
 
 NUM_HYPOTHESES = 8
 AT_REST, CONSTANT_VELOCITY, INITIAL_GUESS = (wp.constant(i) for i in range(3))
-"""Places of the first hypotheses; the guess, if any, is the last of them."""
+"""Indices of the first hypotheses; the guess, if any, is the last of them."""
 CLEARLY_BETTER = wp.constant(wp.float64(0.97))  # ratios of scores
 CLEARLY_WORSE = wp.constant(wp.float64(1.03))
-DECAY = 0.9  # from frame to frame, of a motion that is predicted only
+DECAY = 0.9  # factor per frame for a motion that is only predicted
 NUM_FIRST = 2  # tried first, with the guess if any: at rest and at constant velocity
 
 
@@ -47,10 +47,10 @@ def tracking_hypotheses(last_motion: Float64) -> Float64:
 
 
 def relocalization_hypotheses(attempt: int) -> Float64:
-    """Starts (NUM_HYPOTHESES, 4, 4) of one attempt; successive attempts search wider and wider.
+    """Starts (NUM_HYPOTHESES, 4, 4) of one attempt; later attempts search more widely.
 
-    Each holds the pose of the model view and turns with steps drawn from a fixed sequence, the
-    same in every run.
+    They are the pose of the model view and random motions, drawn with ``attempt`` as the seed and
+    so the same in every run.
     """
     rng = np.random.default_rng(attempt)
     reach = min(1.0, 0.4 + 0.05 * attempt)
@@ -72,19 +72,20 @@ _TURNS_DEG = (  # pan, tilt, roll
 KEYFRAME_HYPOTHESES = np.stack(
     [[_HERE, _HERE, *(_turn(*turn) for turn in turns)] for turns in _TURNS_DEG]
 )
-"""Starts (3, 8, 4, 4) relative to a keyframe, in turns; a turn stands for a sideways step too."""
+"""Starts (3, 8, 4, 4) relative to a keyframe, used in turn; a turn also covers a sideways step."""
 UNMOVED = np.tile(_HERE, (NUM_HYPOTHESES, 1, 1))
 
 
 def damped(motion: Float64) -> Float64:
-    """A motion (4, 4) slowed down a little."""
+    """A motion (4, 4) slowed by ``DECAY``."""
     return se3_exp(DECAY * se3_log(motion))
 
 
 def motion_weight(motions: Float64) -> NDArray[np.float32]:
     """Weights (B,) in [0.5, 1] of frames reached by ``motions`` (B, 4, 4).
 
-    Readings of a fast camera are blurred and skewed; 1 at rest, 0.5 from 0.1 m or 0.1 rad a frame.
+    Readings of a fast camera are blurred and skewed: the weight is 1 at rest and 0.5 from 0.1 m or
+    0.1 rad per frame.
     """
     distance = np.linalg.norm(motions[:, :3, 3], axis=1)
     cosine = (np.trace(motions[:, :3, :3], axis1=1, axis2=2) - 1) / 2
@@ -93,20 +94,20 @@ def motion_weight(motions: Float64) -> NDArray[np.float32]:
 
 
 def is_within(a: Float64, b: Float64, distance_m: float, angle_rad: float) -> bool:
-    """Whether two poses (4, 4) differ by at most so much."""
+    """Whether two poses (4, 4) differ by at most ``distance_m`` and ``angle_rad``."""
     near = np.linalg.norm(a[:3, 3] - b[:3, 3]) <= distance_m
     return bool(near and relative_angle(a[:3, :3], b[:3, :3]) <= angle_rad)
 
 
 def check_poses(poses: Float64, batch: int) -> Float64:
-    """Poses (B, 4, 4); refuse what is none."""
+    """Return poses (B, 4, 4); refuse anything else."""
     if np.ndim(poses) != 3 or len(poses) != batch:
         raise InputError(f"T_world_camera must have shape {(batch, 4, 4)}, got {np.shape(poses)}")
     return np.stack([check_pose(pose, "T_world_camera") for pose in poses])
 
 
 def check_guesses(guesses: Sequence[ArrayLike | None] | None, batch: int) -> Float64 | None:
-    """Guesses (B, 4, 4), NaN where an env has none; None if none has. Refuse what is no pose."""
+    """Guesses (B, 4, 4), NaN for an env without one; None without any. Refuse invalid poses."""
     if guesses is None:
         return None
     if len(guesses) != batch:
@@ -133,7 +134,7 @@ def _score(sums: wp.array3d[wp.float64], b: int, k: int) -> wp.float64:
 
 @wp.kernel
 def expand_hypotheses(first: Hypotheses, more: Hypotheses, good_score: wp.float64) -> None:
-    """Switch on the further hypotheses (B, K2) unless one of the first (B, K1) fits well."""
+    """Switch on the remaining hypotheses (B, K2) unless one of the first (B, K1) fits well."""
     b = wp.tid()
     best = wp.float64(1.0e9)
     for k in range(first.sums.shape[1]):
@@ -150,9 +151,9 @@ def expand_hypotheses(first: Hypotheses, more: Hypotheses, good_score: wp.float6
 
 @wp.kernel
 def select_hypothesis(first: Hypotheses, more: Hypotheses, one: Hypotheses) -> None:
-    """Go on with the hypothesis whose points fit best; it becomes the only one, (B, 1)."""
+    """Select the hypothesis whose points fit best; it becomes the only one, (B, 1)."""
     b = wp.tid()
-    # Where the view leaves directions open all starts fit alike: prefer what is predicted.
+    # If the view leaves directions unconstrained, all starts fit equally: prefer the predicted one.
     best = first.pose[b, CONSTANT_VELOCITY]
     photometry = first.photometry[b, CONSTANT_VELOCITY]
     best_score = _score(first.sums, b, CONSTANT_VELOCITY)

@@ -1,14 +1,14 @@
-"""From sensor images to filtered depth, vertices, normals and intensity, for B envs at once.
+"""Turn sensor images into filtered depth, vertices, normals and intensity, for B envs at once.
 
 ElasticFusion (Whelan et al., RSS 2015) section III: depth is filtered bilaterally. Here the
 filter runs along columns, then rows (Pham and van Vliet, ICME 2005), and on inverse depth, because
 the inverse depth of a plane is linear in the image (so a symmetric window keeps planes) and the
 noise of a structured-light sensor is uniform in it.
 
-In the coarser levels of vertices, normals and intensity invalid pixels leave no trace. Averaging
-over an invalid pixel, or over a depth edge, makes points and grey values that exist nowhere; they
-break tracking at the coarse levels. A coarse pixel is the mean of those pixels of its 2x2 block
-that are valid and lie near the front-most of them.
+Invalid pixels do not affect the coarser levels of vertices, normals and intensity. Averaging over
+an invalid pixel, or across a depth edge, would make points and grey values that do not exist and
+break tracking at the coarse levels. A coarse pixel is the mean of those valid pixels of its 2x2
+block that lie near the front-most of them.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ FLATTEST = wp.constant(5.67)  # tangent of 80 degrees, of the view onto a plane 
 class LiveFrame:
     """The sensor's frames of B envs after preprocessing, on the device."""
 
-    raw_depth: wp.array  # (B, H, W) float32 metres as sensed; 0 = no reading or beyond the cutoff
+    raw_depth: wp.array  # (B, H, W) float32 metres as sensed; 0 = no reading
     depth: wp.array  # (B, H, W) float32 metres, bilaterally filtered and cut off; 0 = no reading
     vertices: wp.array  # (B, H, W) vec3 back-projected ``depth``, camera frame; z = 0 where invalid
     # (B, H, W) vec3 unit normals, camera frame, towards the camera; 0 where invalid.
     normals: wp.array
     color: wp.array  # (B, H, W) vec3 RGB in [0, 255]
     intensity: wp.array  # (B, H, W) float32 in [0, 255] (BT.601 luma of ``color``)
-    moving: wp.array  # (B, H, W) int32, 1 where the motion mask says that something moves
+    moving: wp.array  # (B, H, W) int32, 1 where the motion mask marks something moving
 
 
 @wp.kernel
@@ -59,7 +59,7 @@ def _convert(
     color: wp.array[wp.vec3],
     intensity: wp.array[wp.float32],
 ) -> None:
-    """Inverse depth (0 for no reading or one beyond the cutoff), colour and its BT.601 luma."""
+    """Compute inverse depth (0: no reading, or beyond the cutoff), colour and BT.601 luma."""
     row, piece = wp.tid()
     i = row * width + piece * columns
     end = row * width + wp.min((piece + 1) * columns, width)
@@ -83,15 +83,15 @@ def _filter(
     columns: wp.int32,
     along_rows: wp.int32,  # 1: neighbours are in the same row; 0: in the same column
     spatial_weights: wp.array[wp.float32],  # (radius + 1,)
-    per_cutoff_squared: wp.float32,  # 1 / (difference of inverse depth that weighs nothing)^2
+    per_cutoff_squared: wp.float32,  # 1 / (difference of inverse depth with zero weight)^2
     weights: wp.array[wp.float32],  # working memory, per pixel
     shifts: wp.array[wp.float32],
     filtered: wp.array[wp.float32],
 ) -> None:
     """Bilateral filter along the rows or the columns of the image.
 
-    The loop over neighbours is outside, the one over pixels inside and without branches: the
-    compiler turns it into operations on many pixels at once.
+    The outer loop runs over neighbours; the inner loop runs over pixels and has no branches, so the
+    compiler vectorizes it.
     """
     row, piece = wp.tid()
     v = row % height
@@ -136,11 +136,11 @@ def _filter(
 
 @wp.func
 def _slope(before: float, here: float, after: float, largest: float, steepest: float) -> wp.vec2:
-    """Difference per step of inverse depth to valid neighbours; (slope, 1), or (0, 0) if none.
+    """Slope of inverse depth per step to valid neighbours: (slope, 1), or (0, 0) without any.
 
     Inputs are inverse depths, 0 where invalid. A side that jumps by more than ``largest`` is an
-    edge, unless both sides continue one plane that is seen no flatter than ``steepest``: up close
-    the inverse depth of a tilted plane changes as much from pixel to pixel, all over it.
+    edge, unless both sides lie on one plane whose slope is within ``steepest``: up close, the
+    inverse depth of a tilted plane changes that much from pixel to pixel everywhere.
     """
     difference = after - here
     difference_back = here - before
@@ -168,8 +168,8 @@ def _normal(
     """Unit normal of a pixel from its inverse depth and its neighbours'; 0 where invalid."""
     slope_u = _slope(left, inverse, right, largest, FLATTEST / focal_per_step[0])
     slope_v = _slope(above, inverse, below, largest, FLATTEST / focal_per_step[1])
-    # On a plane n . p = d, inverse depth is n . ray / d, linear in the ray's x and y:
-    # its gradient there, and its value at ray (0, 0, 1), are the normal up to scale.
+    # On a plane n . p = d, inverse depth is n . ray / d, linear in the ray's x and y. Its gradient,
+    # and its value at ray (0, 0, 1), are the normal up to scale.
     a = slope_u[0] * focal_per_step[0]
     c = slope_v[0] * focal_per_step[1]
     normal = wp.vec3(a, c, inverse - a * ray[0] - c * ray[1])
@@ -192,7 +192,7 @@ def _surface(
     vertices: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
 ) -> None:
-    """Depth, vertices and normals of filtered inverse depth."""
+    """Compute depth, vertices and normals from filtered inverse depth."""
     row, piece = wp.tid()
     v = row % height
     start = row * width
@@ -287,7 +287,7 @@ class Preprocessor:
         return self.frame
 
     def _record(self) -> list[RecordedLaunch]:
-        """The stages; all buffers stay."""
+        """Record the launches of all stages; they use the same buffers every time."""
         frame, config, camera, dim = self.frame, self.config, self.intrinsics, self._dim
         size = [camera.height, camera.width, self._columns]
         inverse, filtered = self._inverse_depth.flatten(), self._filtered.flatten()
@@ -347,18 +347,18 @@ def check_images(color: Any, depth: Any, size: tuple[int, ...]) -> None:
         raise InputError(BAD_DEPTH)
 
 
-EDGE_FRACTION = 0.03  # pixels of a block further behind the front one than this are another surface
+EDGE_FRACTION = 0.03  # of depth; pixels further behind a block's front one are another surface
 
 
 @wp.func
 def _share(p: wp.vec3, limit: float) -> float:
-    """1 for a valid pixel that is not behind the limit, else 0."""
+    """Return 1 for a valid pixel that is not behind the limit, else 0."""
     return wp.where(p[2] > 0.0 and p[2] <= limit, 1.0, 0.0)
 
 
 @wp.func
 def _distance(p: wp.vec3) -> float:
-    """Depth of a pixel; very far where invalid."""
+    """Depth of a pixel; a very large value if invalid."""
     return wp.where(p[2] > 0.0, p[2], 1.0e9)
 
 
@@ -410,7 +410,7 @@ def _downsample(
         scale = wp.where(has_normal, 1.0 / wp.sqrt(wp.where(has_normal, squared, 1.0)), 0.0)
         put(coarse_vertices, i, (s00 * p00 + s01 * p01 + s10 * p10 + s11 * p11) * per_count)
         put(coarse_normals, i, scale * normal)
-        # The sensor's grey value is good where its depth is missing.
+        # The sensor's grey value is valid even where its depth is missing.
         mean = 0.25 * (i00 + i01 + i10 + i11)
         put(coarse_intensity, i, wp.where(count > 0.0, grey, mean))
         u += 1
@@ -451,7 +451,7 @@ def _intensity_gradient(
 
 @dataclass(frozen=True)
 class Level:
-    """One pyramid level; arrays (B, h, w). ``gradient`` holds (I, dI/du, dI/dv), or nothing."""
+    """One pyramid level; arrays (B, h, w). ``gradient`` holds (I, dI/du, dI/dv), or is empty."""
 
     vertices: wp.array
     normals: wp.array
@@ -498,7 +498,7 @@ class Pyramid:
             self._coarse.append(Level(*images, gradient()))
 
     def build(self, vertices: wp.array, normals: wp.array, intensity: wp.array) -> list[Level]:
-        """All levels, finest first, of images (B, H, W); the coarse ones overwrite the last."""
+        """All levels of images (B, H, W), finest first; overwrites earlier coarse levels."""
         if not self._levels or self._levels[0].vertices is not vertices:
             self._levels = [Level(vertices, normals, intensity, self._gradient), *self._coarse]
             self._launches = [self._downsampling(*pair) for pair in pairwise(self._levels)]
@@ -521,7 +521,7 @@ class Pyramid:
         return RecordedLaunch(_intensity_gradient, self._dim(image), inputs, self._device)
 
     def _dim(self, image: wp.array) -> tuple[int, int]:
-        """Threads of a kernel that writes ``image`` (B, h, w): a piece of a row each."""
+        """Threads of a kernel that writes ``image`` (B, h, w), each a piece of a row."""
         batch, height, width = image.shape
         return batch * height, -(-width // self._columns)
 
@@ -534,8 +534,8 @@ class Pieces:
     """Connected pieces of a depth image, cut at steps of inverse depth and at creases.
 
     Attributes:
-        labels: (h, w) number of the piece; 0 for the seams.
-        count: of the labels, 0 included.
+        labels: (h, w) label of the piece; 0 on seams.
+        count: number of labels, 0 included.
     """
 
     def __init__(
@@ -546,8 +546,8 @@ class Pieces:
         Args:
             depth: (h, w) metres, 0 = no reading.
             normals: (h, w, 3) unit vectors; 0 = none.
-            largest_step: of inverse depth between neighbours, 1/m.
-            least_cosine: of the angle between their normals.
+            largest_step: largest step of inverse depth within a piece, between neighbours, 1/m.
+            least_cosine: least cosine of the angle between their normals.
         """
         is_inner = depth > 0
         inverse = np.where(is_inner, 1.0 / np.where(is_inner, depth, 1.0), -np.inf)
@@ -560,17 +560,17 @@ class Pieces:
         self.count, self.labels = count, np.asarray(labels)
 
     def number(self, where: Bool) -> NDArray[np.int64]:
-        """(count,) pixels of each piece that are set in (h, w)."""
+        """Number (count,) of pixels of each piece that are set in ``where`` (h, w)."""
         return np.bincount(self.labels[where], minlength=self.count)
 
     def where(self, votes: Bool, against: Bool, share: float, least: NDArray[np.float64]) -> Bool:
-        """Pixels (h, w) of the pieces that are voted for.
+        """Pixels (h, w) of the pieces that win the vote.
 
         Args:
-            votes: (h, w) for.
-            against: (h, w), unless they vote for.
-            share: of both that must be for.
-            least: (count,) votes, more than which there must be.
+            votes: (h, w) pixels for.
+            against: (h, w) pixels against, unless they are in ``votes``.
+            share: the share for must be larger than this.
+            least: (count,) the number for must be larger than this.
         """
         own, others = self.number(votes), self.number(against & ~votes)
         chosen = (own > share * (own + others)) & (own > least)
@@ -578,9 +578,10 @@ class Pieces:
         return chosen[self.labels]
 
     def filled(self, values: Float32, limit: float) -> Float32:
-        """Values (h, w); where more than half of a piece is above a limit, no less than their mean.
+        """Raise values (h, w) of pieces mostly above a limit to the mean of those above it.
 
-        So the parts of a thing that come into view are taken for what the rest of it is.
+        "Mostly" is more than half of the pixels. So a part that comes into view is treated like the
+        rest of its object.
         """
         is_above = values > limit
         above, all_pixels = self.number(is_above), np.bincount(self.labels.ravel())

@@ -1,16 +1,15 @@
 # mypy: disable-error-code="empty-body"
 # ruff: noqa: UP018, RUF046
-"""Renders surfel maps: footprints, z-buffer, average of the front surface, resolve.
+"""Render surfel maps: footprints, z-buffer, average of the front surface, resolve.
 
-Two passes over the visible discs: the first finds the nearest surface of every pixel, the second
-averages all discs within the depth tolerance behind it (the visibility splatting of Botsch et al.,
+There are two passes over the visible discs: the first finds the nearest surface of every pixel, the
+second averages all discs within the depth tolerance behind it (visibility splatting: Botsch et al.,
 "High-quality surface splatting on today's GPUs", 2005). The inverse depth of a disc's plane is
-linear in the image, so the depth at a pixel is that of the viewing ray's intersection with the
-plane, at the cost of two multiplications; z-buffers hold inverse depth, 0 where empty.
+linear in the image, so intersecting the viewing ray with the plane costs two multiplications per
+pixel. Z-buffers hold inverse depth, 0 where empty.
 
 Launches are (envs, workers): the workers of an env share its list, and the CPU's single worker
-keeps the camera in registers. Image buffers are flat, which saves most of their address
-arithmetic.
+keeps the camera in registers. Flat image buffers save most of the address arithmetic.
 """
 
 from __future__ import annotations
@@ -41,11 +40,11 @@ from ms_slam_env.slam.surfel.surfels import (
 def half_extent(
     p: wp.vec3, n: wp.vec3, across: float, tilt: float, radius: float, focal: float
 ) -> float:
-    """How far a disc at p reaches from its centre in columns or rows.
+    """Extent of a disc at p from its centre, in columns or rows.
 
     A tilted disc is an ellipse: an offset d in its plane moves the column by (f / z) a . d with
-    a = (1, 0, -x / z), at most |d| times a's part in the plane. ``across`` is x or y, ``tilt`` the
-    normal's component there. The twentieth part more allows for perspective.
+    a = (1, 0, -x / z), at most |d| times a's component in the plane. ``across`` is x or y, ``tilt``
+    the normal's component along it. An extra 5 % allows for perspective.
     """
     ratio = across / p[2]
     part = tilt - ratio * n[2]
@@ -55,7 +54,7 @@ def half_extent(
 
 @wp.func
 def drawn_radius(radius: float, z: float, camera: SplatCamera) -> float:
-    """Radius in metres after the limits in pixels."""
+    """Radius in metres, clamped to the limits in pixels."""
     pixel = z / camera.focal[0]
     return wp.clamp(radius, camera.min_px * pixel, camera.max_px * pixel)
 
@@ -64,7 +63,7 @@ def drawn_radius(radius: float, z: float, camera: SplatCamera) -> float:
 def project_footprints(
     visible: VisibleList, camera: SplatCamera, workers: int, footprints: SplatFootprints
 ) -> None:
-    """Footprints of the listed surfels.
+    """Compute the footprints of the listed surfels.
 
     Several short loops without branches: the compiler turns them into operations on many surfels
     at once, which it does not for loops that write many arrays. Of many workers each takes one
@@ -130,10 +129,10 @@ Sums: Any = wp.types.vector(length=8, dtype=wp.float32)
 
 @wp.func
 def squared_offset(x: float, y: float, z: float, inverse_offset: float) -> float:
-    """Squared distance (m2) from the centre of a disc at depth z of a point of its plane.
+    """Squared distance (m2) of a point in a disc's plane from the disc's centre at depth z.
 
-    The point is x, y (m) and an inverse depth away from the centre. To first order in the offset:
-    only the disc's rim moves, by less than its perspective.
+    The point differs from the centre by x, y (m) and an inverse depth. The distance is exact to
+    first order in the offset; the error only moves the disc's rim, by less than its perspective.
     """
     away = z * z * inverse_offset
     return x * x + y * y + away * away
@@ -207,7 +206,7 @@ def splat_attributes(
 ) -> None:
     """Sum the discs of the front surface at every pixel.
 
-    The weight is the confidence, at most ``max_weight``, falling off towards the disc's rim.
+    Their weight is the confidence, at most ``max_weight``, and falls off towards the disc's rim.
     """
     k, worker = wp.tid()
     b = first_env + k
@@ -344,7 +343,7 @@ class SplatParameters:
 
 
 def splat_camera(intrinsics: Intrinsics, parameters: SplatParameters) -> SplatCamera:
-    """The camera as the kernels take it."""
+    """Build the camera struct for the kernels."""
     camera = SplatCamera()
     camera.width, camera.height = intrinsics.width, intrinsics.height
     camera.focal = wp.vec2(intrinsics.fx, intrinsics.fy)
@@ -357,9 +356,9 @@ def splat_camera(intrinsics: Intrinsics, parameters: SplatParameters) -> SplatCa
 class SplatRenderer:
     """Renders ``envs`` of the maps in ``buffers``, one pose each, at one image size.
 
-    The launches are recorded once: a recorded one costs a fifth of packing its arguments anew.
+    Launches are recorded once; a recorded launch costs a fifth of one that packs its arguments.
 
-    ``splat`` overwrites ``view``; ``cull`` fills ``visible``, as other renderers of the map do.
+    ``splat`` overwrites ``view``. ``cull`` fills ``visible``, which all renderers of the map share.
     Only surfels last seen within ``window`` are drawn; None: all.
     """
 
@@ -406,7 +405,7 @@ class SplatRenderer:
     ) -> None:
         """List the surfels that the cameras at ``poses`` (envs,) T_world_camera can see.
 
-        Of many discs to a pixel only so many that ``layers`` surfaces of them are left.
+        If there are many discs per pixel, they are thinned to about ``layers`` surfaces.
         """
         self._culler(poses, first_env, margin_px, layers)
 

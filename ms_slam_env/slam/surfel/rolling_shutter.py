@@ -1,18 +1,18 @@
 # mypy: disable-error-code="empty-body"
-"""Frames of a rolling shutter, made into what the camera would have seen at one instant.
+"""Undo the rolling shutter: compute the frame that the camera would have seen at one instant.
 
-The rows of an image are read one after the other, so each is seen from a place of its own. Between
-two frames the camera is taken to move evenly, as on the straight pieces of a continuous trajectory
-(Kerl, Stueckler, Cremers, "Dense continuous-time tracking and mapping with rolling shutter RGB-D
-cameras", ICCV 2015): with the twist xi = log(T_before^-1 T_now) of its motion over the time between
-them, a point p of the row that is read a share s of that time after the middle row lies at
+The rows of an image are read one after the other, each from a different pose. The camera is assumed
+to move at constant velocity between two frames, as on a piece of a continuous trajectory (Kerl,
+Stueckler, Cremers, "Dense continuous-time tracking and mapping with rolling shutter RGB-D cameras",
+ICCV 2015). Let xi = log(T_before^-1 T_now) be the twist of its motion between them. A point p of a
+row that is read a share s of that time after the middle row lies at
 
     q = exp(s xi) p
 
-in the camera of the middle row. Every pixel of the levelled image looks up which point of the
-frame comes to lie in it. The frame is levelled with the last motion, aligned, and levelled and
-aligned once more with the motion that was found. The first frame, of which nothing is known, is
-mapped anew once the second one has been found.
+in the camera of the middle row. Every pixel of the levelled image looks up the point of the frame
+that falls into it. The frame is levelled with the last motion and aligned, then levelled with the
+motion found and aligned again. The first frame has no known motion; it is mapped again once the
+second one is aligned.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.surfel.device import SavedBuffer
 from ms_slam_env.slam.surfel.preprocessing import check_images
 
-PIECE = 64  # columns that are worked on together, by short loops over several of them at once
+PIECE = 64  # columns processed together, by short loops that the compiler vectorizes
 
 
 @wp.struct
 class Rows:
-    """Frames of B envs as they were read, flat, and the motion that goes with them."""
+    """Frames of B envs as they were read, flat, and the motion during the readout."""
 
     color: wp.array[wp.uint8]
     depth: wp.array[wp.float32]
-    turn: wp.array[wp.vec3]  # (B,) over the time from the first row to the last, radians
-    step: wp.array[wp.vec3]  # metres
+    turn: wp.array[wp.vec3]  # (B,) rotation from the first row to the last, radians
+    step: wp.array[wp.vec3]  # (B,) translation, metres
     size: wp.vec2i  # (width, height)
     focal: wp.vec2
     centre: wp.vec2
@@ -59,7 +59,7 @@ def level_piece(
     color: wp.array[wp.uint8],
     depth: wp.array[wp.float32],
 ) -> None:
-    """Fill a piece of row v of the levelled images of env b, all of its pixels step by step."""
+    """Fill a piece of row v of the levelled images of env b."""
 
 
 @wp.kernel
@@ -111,10 +111,10 @@ class _Leveller:
 
 
 class Shutter(Saved):
-    """How the rows of the frames of B envs are taken: the last ``readout_s`` after the first.
+    """Levels frames of B envs whose last row is read ``readout_s`` after the first.
 
-    Frames whose time is not known, or is not after the last one's, are left as they are; all are
-    where ``readout_s`` is 0.
+    Frames without a timestamp, or with one that is not later than the last, are left as they are;
+    with ``readout_s`` 0 all are.
     """
 
     def __init__(self, batch: int, readout_s: float, device: str) -> None:
@@ -123,21 +123,21 @@ class Shutter(Saved):
             self.saved = ("_times", "_intervals")  # type: ignore[misc]
         self._readout_s, self._device = readout_s, device
         self._times: Float64 = np.full(batch, np.nan)
-        self._intervals: Float64 = np.full(batch, np.nan)  # between them and those before
+        self._intervals: Float64 = np.full(batch, np.nan)  # since the previous frames
         self._leveller: _Leveller
 
     def use(self, intrinsics: Intrinsics) -> None:
-        """Expect frames of a camera."""
+        """Prepare for frames of a camera."""
         if self.is_rolling:
             self._leveller = _Leveller(len(self._times), intrinsics, self._device)
 
     def take_time(self, times_s: Sequence[float] | None) -> None:
-        """From now on motions are those that led to the frames of these times (B,)."""
+        """Set the times (B,) of the present frames; ``level`` then takes the motions to them."""
         now = np.full_like(self._times, np.nan) if times_s is None else np.array(times_s, float)
         self._intervals, self._times = now - self._times, now
 
     def level(self, taken: Images, motions: Float64) -> Images:
-        """The frames as of one instant, with cameras that move like ``motions`` (B, 4, 4)."""
+        """Level frames whose cameras moved by ``motions`` (B, 4, 4) since the previous frames."""
         if not self.is_rolling:
             return taken
         is_later = self._intervals > 0

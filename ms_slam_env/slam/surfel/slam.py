@@ -75,7 +75,7 @@ class BatchedSurfelSlam(Saved):
         return self._states.poses
 
     def reconfigure(self, config: SurfelConfig, intrinsics: Intrinsics) -> None:
-        """Go on with other parameters and frame size; see ``SurfelSlam.reconfigure``."""
+        """Continue with other parameters and frame size; see ``SurfelSlam.reconfigure``."""
         if (config, intrinsics) == (self.config, self.intrinsics):
             return
         check_change(self.config, config, intrinsics != self.intrinsics)
@@ -85,7 +85,7 @@ class BatchedSurfelSlam(Saved):
         self._use(self._pipelines.get(intrinsics, config))
 
     def _use(self, pipeline: Pipeline) -> None:
-        """Look at frames, and at the maps, in this way from now on."""
+        """Process frames and maps with ``pipeline`` from now on."""
         self.intrinsics, self.config = pipeline.intrinsics, pipeline.config
         self.preprocess, self.tracker = pipeline.preprocess, pipeline.tracker
         self._correct_exposure = pipeline.correct_exposure
@@ -280,14 +280,14 @@ class BatchedSurfelSlam(Saved):
         )
 
     def attach_map(self, detached: DetachedMap, env: int = 0) -> None:
-        """Go on with another map; the camera stays where it is."""
+        """Continue in another map; the camera stays where it is."""
         self.map.set_surfels(env, detached.surfels)
         self.relocalization.set_keyframes(env, detached.keyframes)
         self.loops.set_history(env, detached.history)
         self.aligner.forget_view()
 
     def restart(self, T_world_camera: Float64, env: int = 0) -> None:
-        """Forget an env's map and its last frame, which is to be taken first of a new one.
+        """Forget an env's map and last frame; track that frame again to start a new map.
 
         What the recording's noise is stays known, and how far the map has drifted.
         """
@@ -299,7 +299,7 @@ class BatchedSurfelSlam(Saved):
         self.expect_noise(noise, env)
 
     def noise(self, env: int = 0) -> tuple[np.void, float]:
-        """What an env's recording has shown of its noise."""
+        """The noise that an env's recording has shown."""
         return self._states.noise(env)
 
     def expect_noise(self, noise: tuple[np.void, float], env: int = 0) -> None:
@@ -313,18 +313,18 @@ class BatchedSurfelSlam(Saved):
         self._last_frames.move(env, self.poses[env])
 
     def last_frame(self, env: int = 0) -> int:
-        """Number of an env's last frame."""
+        """Index of an env's last frame."""
         return int(self._states.time[env]) - 1
 
     def mark_lost(self, env: int = 0) -> None:
-        """Seek an env's next frame in its map, whatever the light is by now."""
+        """Relocalize an env's next frame in its map, at any exposure."""
         if self._states.started[env]:
             self._states.hold(np.arange(self.batch) == env)
             self._states.forget_exposure(env)
             self.motion_mask.forget(env)
 
     def motion(self, env: int = 0) -> Float64:
-        """Motion (4, 4) that is expected of an env's next frame."""
+        """Expected motion (4, 4) to an env's next frame."""
         return self._states.motions[env].copy()
 
     def drift(self, env: int = 0) -> Float64:
@@ -332,7 +332,7 @@ class BatchedSurfelSlam(Saved):
         return self._states.drift[env].copy()
 
     def frames_lost(self, env: int = 0) -> int:
-        """Frames since an env's tracking was lost; 0: it is not."""
+        """Number of frames since an env lost tracking; 0 while tracking."""
         return int(self._states.lost[env])
 
     def keyframe_poses(self, env: int = 0) -> Float64:
@@ -346,7 +346,7 @@ class BatchedSurfelSlam(Saved):
         return readings >= FEWEST_READINGS and (not blank or self._invalid_frames.colorless[env])
 
     def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly, as NumPy arrays."""
+        """Everything needed to continue bit-exactly, as NumPy arrays."""
         return self._states.get_state() | super().get_state() | self._shutter.get_state()
 
     def state_like(self) -> Any:
@@ -355,7 +355,7 @@ class BatchedSurfelSlam(Saved):
         return own[0] | own[1] | own[2]
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state of a SLAM of the same batch, intrinsics and configuration."""
+        """Restore a state of a SLAM of the same batch, intrinsics and configuration."""
         check_has(state, ("map",), "SurfelSlam")
         self.map.check_fits(state["map"])
         self._states.set_state(state)

@@ -38,7 +38,7 @@ from ms_slam_env.slam.surfel.normal_equations import (
 mat66d: Any = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
 mat76d: Any = wp.types.matrix(shape=(7, 6), dtype=wp.float64)
 vec6d: Any = wp.types.vector(length=6, dtype=wp.float64)
-NORMAL_NOISE = wp.constant(wp.float64(0.3))  # share of that mean that is worth nothing
+NORMAL_NOISE = wp.constant(wp.float64(0.3))  # share of that mean that counts as noise
 LEAST_INFORMATION = wp.constant(wp.float64(0.5))  # per matched point, 1/m^2: 2 cm of 5000 points
 OPEN_VARIANCE = wp.constant(wp.float64(0.03 * 0.03))  # m^2, of a frame's predicted motion
 GEOMETRIC_NOISE = wp.constant(wp.float64(0.022))  # covariance of the gradient over A or B;
@@ -130,8 +130,8 @@ def pose_covariance(
 ) -> wp.spatial_matrixd:
     """Covariance H^-1 (a A + b B) H^-1 of the pose, metres and radians, H = A + B in metres.
 
-    The weights of the two terms were chosen for accuracy, so H^-1 is no covariance: a A and b B
-    are those of the gradients. Along directions that the view leaves open it is the prediction's.
+    The weights of the two terms were chosen for accuracy, so H^-1 is no covariance; a A and b B are
+    the covariances of the gradients. Unconstrained directions have the prediction's covariance.
     """
     inverse = mat66d()
     C = mat66d()
@@ -160,7 +160,7 @@ def reduce_sum(hypotheses: Hypotheses, slots: int, b: int, k: int, i: int) -> No
 
 @wp.func_native(native_source("sum_reduction", "reduce_all_sums", SUMS=NUM_SUMS))
 def reduce_all_sums(hypotheses: Hypotheses, slots: int, b: int, k: int) -> None:
-    """The same for all of them, several at a time."""
+    """Add up all partial sums of hypothesis k of env b, several at a time."""
 
 
 @wp.kernel
@@ -425,10 +425,10 @@ def iterate_at_once(
     iterations: int,
     ends_with_sums: int,  # 1: leave the sums at the poses that the last steps led to
 ) -> None:
-    """All iterations of a level, one thread a hypothesis.
+    """Run all iterations of a level, one thread per hypothesis.
 
-    The same as ``accumulate_normal_equations``, ``reduce_sums`` and ``gauss_newton_step`` in turns,
-    for a CPU: there a launch takes as long as a tenth of the work.
+    Equals alternating ``accumulate_normal_equations``, ``reduce_sums`` and ``gauss_newton_step``.
+    For the CPU, where a launch takes as long as a tenth of the work.
     """
     b, k = wp.tid()
     pieces = (images.model_size[0] + columns - 1) // columns

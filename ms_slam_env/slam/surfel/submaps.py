@@ -1,11 +1,10 @@
-"""Submaps of the surfel SLAM of one camera: begin one when lost, find older ones, join them.
+"""Submaps of the surfel SLAM of one camera: start one when lost, find older ones, join them.
 
-The idea of ORB-SLAM's Atlas (Elvira, Tardós and Montiel, IROS 2019). A frame that is refused is not
-the end: after a few of them the map is put aside, and a new one starts where the camera is best
-guessed to be. While it grows, every few frames the camera is looked for in the maps put aside: near
-where it should be and at keyframes that resemble the frame. Several such looks from different
-places must agree on how the maps lie, and the views of both maps must agree there; then the newer
-map is moved onto the older, and both are one again.
+The idea of ORB-SLAM's Atlas (Elvira, Tardós and Montiel, IROS 2019). After a few refused frames the
+map is set aside, and a new one starts at the best guess of the camera's pose. Every few frames, the
+camera is then searched for in the maps set aside: near its expected pose, and at similar keyframes.
+When several searches from different places agree on the relative pose of the maps, and the views of
+both maps agree there, the newer map is moved onto the older one and the two are merged.
 """
 
 from __future__ import annotations
@@ -40,30 +39,30 @@ _FIT = FitConfig(queries=8)
 
 
 class FrameLookup:
-    """Looks for a frame in the map of a SLAM of one camera, which stays as it is."""
+    """Looks for a frame in the map of a SLAM of one camera, without changing the map."""
 
     def __init__(self, slam: BatchedSurfelSlam, frames: Images) -> None:
-        """Look for ``frames`` (1, H, W) from now on; the SLAM's next frame ends that."""
+        """Look for ``frames`` (1, H, W); valid until the SLAM's next frame."""
         self._slam, self._frames = slam, frames
         slam.aligner.set_frame(slam.preprocess(frames.color, frames.depth))
 
     def align_near(self, pose: Float64) -> Alignment:
-        """Align with the map as seen from ``pose`` (4, 4), under strict thresholds."""
+        """Align with the map's view from ``pose`` (4, 4), under strict thresholds."""
         return self._slam.aligner.align_strictly(pose[None], tracking_hypotheses(np.eye(4))[None])
 
     def consistency(self, poses: Float64) -> AlignmentStatistics:
-        """How the frame agrees with the map's view from ``poses`` (1, 4, 4)."""
+        """Statistics of the frame's agreement with the map's view from ``poses`` (1, 4, 4)."""
         slam, wanted = self._slam, np.ones(1, dtype=bool)
         cutoff_m = slam.config.depth_cutoff_m
         return measure_consistency(self._frames, poses, wanted, slam.aligner, cutoff_m)[0]
 
     def verify(self, poses: Float64) -> bool:
-        """Whether the map's view from ``poses`` (1, 4, 4) is like the frame."""
+        """Whether the map's view from ``poses`` (1, 4, 4) agrees with the frame."""
         slam, found = self._slam, np.ones(1, dtype=bool)
         return bool(slam.relocalization.verify(self._frames, poses, found, slam.aligner)[0])
 
     def propose(self, attempt: int) -> Float64 | None:
-        """A pose (4, 4) where the frame may have been taken, from keyframes; None without."""
+        """A candidate pose (4, 4) of the frame, from keyframes; None if there is none."""
         slam, lost = self._slam, np.ones(1, dtype=bool)
         attempts = np.array([attempt], dtype=np.int32)
         poses = slam.relocalization.propose(self._frames, lost, attempts, slam.aligner)
@@ -71,7 +70,7 @@ class FrameLookup:
 
 
 class MapFinder:
-    """Finds frames in maps that were put aside; nothing is fused."""
+    """Finds frames in maps that were set aside; fuses nothing."""
 
     def __init__(self, slam: BatchedSurfelSlam) -> None:
         self._present = slam
@@ -80,7 +79,7 @@ class MapFinder:
 
     @property
     def map(self) -> SurfelMap:
-        """The surfels of the map that was searched last."""
+        """The surfels of the map searched last."""
         return self._slam.map
 
     def keyframe_poses(self) -> Float64:
@@ -88,15 +87,15 @@ class MapFinder:
         return self._slam.keyframe_poses()
 
     def forget(self) -> None:
-        """Load a map anew next time."""
+        """Reload the map at the next search."""
         self._loaded = None
 
     def dissimilarity(self, frames: Images, other: DetachedMap) -> float:
-        """Of a frame and the keyframe of a map that resembles it most; infinity: it has none."""
+        """Dissimilarity of a frame and a map's most similar keyframe; infinity without any."""
         return self._present.relocalization.least_dissimilarity(0, frames, other.keyframes)
 
     def near(self, frames: Images, other: DetachedMap, pose: Float64) -> Float64 | None:
-        """Where in a map a frame was taken if that is near ``pose`` (4, 4); None if it is not."""
+        """Pose of a frame in a map, found near ``pose`` (4, 4); None if it is not there."""
         lookup = self._lookup(other, frames)
         found = lookup.align_near(pose)
         if not found.tracked[0] or not lookup.verify(found.T_world_live):
@@ -104,14 +103,14 @@ class MapFinder:
         return found.T_world_live[0]
 
     def anywhere(self, frames: Images, other: DetachedMap, attempt: int) -> Float64 | None:
-        """Where in a map a frame was taken, from keyframes that resemble it; None if none does."""
+        """Pose of a frame in a map, found from similar keyframes; None if it is not found."""
         pose = self._lookup(other, frames).propose(attempt)
         return None if pose is None else self.near(frames, other, pose)
 
     def bears_out(self, slam: BatchedSurfelSlam, T_other_present: Float64, pose: Float64) -> bool:
-        """Whether the views of the map found last and of ``slam``'s agree on how the maps lie.
+        """Whether views of the map found last and of ``slam``'s map bear out ``T_other_present``.
 
-        They are views from where cameras were, near ``pose`` (4, 4) in ``slam``'s map.
+        The views are rendered from past camera poses near ``pose`` (4, 4) in ``slam``'s map.
         """
         own = np.concatenate([slam.keyframe_poses(), pose[None]])
         present = MapViews.of(slam.map, own, pose)
@@ -129,16 +128,16 @@ class MapFinder:
 
 
 class JointSearch(Saved):
-    """How the present map lies relative to one of those put aside: the looks that agree on it."""
+    """Search for the pose of the present map relative to one set aside: the agreeing looks."""
 
     saved = ("_label", "_votes", "_frame", "_pose", "_looks")
 
     def __init__(self) -> None:
-        self._label: int | None = None  # of the map put aside; None: nothing was found yet
+        self._label: int | None = None  # of the map set aside; None: nothing found yet
         self._votes: list[Float64] = []  # (4, 4) T_other_present of each look
         self._frame: int | None = None  # of the last look
         self._pose = np.eye(4)  # (4, 4) in the present map at the last look
-        self._looks = 0  # in vain, since the map was lost
+        self._looks = 0  # unsuccessful looks since the map was lost
 
     def state_like(self) -> Any:
         """See ``Stateful``."""
@@ -150,7 +149,7 @@ class JointSearch(Saved):
         return Fields(super().state_like() | like, _why_no_search)
 
     def is_due(self, frame: int, pose: Float64, rules: SubmapConfig) -> bool:
-        """Whether it is time for a look; the next one that may agree is from another place."""
+        """Whether to look now: after an interval, or to confirm a result from another place."""
         if self._frame is None or frame - self._frame >= rules.interval:
             return True
         moved = not is_within(pose, self._pose, rules.step_m, np.radians(rules.step_deg))
@@ -165,7 +164,7 @@ class JointSearch(Saved):
         finder: MapFinder,
         rules: SubmapConfig,
     ) -> tuple[DetachedMap, Float64] | None:
-        """Look for the camera at ``pose`` (4, 4) in the maps put aside.
+        """Look for the camera at ``pose`` (4, 4) in the maps set aside.
 
         Returns:
             The map and T_other_present (4, 4), once enough looks agree.
@@ -212,14 +211,14 @@ class JointSearch(Saved):
 
 
 def _why_no_search(state: dict[str, Any]) -> str:
-    """What is wrong between the label of a state and its votes."""
+    """Error message if the label of a state does not fit its votes."""
     is_known = state["label"] is not None
     return "" if is_known == bool(state["votes"]) else "has votes without a label, or a label alone"
 
 
 @dataclass(frozen=True)
 class MapViews:
-    """A map and what it shows from where cameras were, in the place of their frames."""
+    """A map and its views from past camera poses, used in place of recorded frames."""
 
     backend: SurfelMap
     frames: list[RGBDFrame]  # N
@@ -228,7 +227,7 @@ class MapViews:
 
     @classmethod
     def of(cls, surfel_map: SurfelMap, poses: Float64, here: Float64) -> MapViews:
-        """Views from those of the poses (K, 4, 4) that are nearest to one (4, 4)."""
+        """Views from the poses among ``poses`` (K, 4, 4) that are nearest to ``here`` (4, 4)."""
         distance = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
         chosen = poses[np.argsort(distance, kind="stable")[: _FIT.queries]]
         frames = _as_frames(surfel_map.predict(chosen))
@@ -241,20 +240,20 @@ def _as_frames(views: Views) -> list[RGBDFrame]:
 
 
 CARRIED_ON = 0.95
-"""From frame to frame, of the last motion, which is all that is known of a lost camera.
+"""Factor per frame for the last motion, with which a lost camera is extrapolated.
 
-On hand-held paths, lr kt3 and the walk with a HoloLens it put the camera after 5 frames 2 to 4
-times, after 10 frames 1.7 to 2.6 times closer to where it was than standing still; 0.8 and 1 did
-worse on some.
+On hand-held paths, lr kt3 and the walk with a HoloLens, extrapolation came 2 to 4 times closer to
+the true position after 5 frames than standing still, and 1.7 to 2.6 times closer after 10; 0.8 and
+1 did worse on some.
 """
 UNFORESEEN = 0.3
-"""Standard deviation of a coordinate of that pose, in last motions, by every frame carried on."""
+"""Standard deviation per extrapolated frame, in units of the last motion."""
 
 
 class AtlasSubmaps(Saved):
-    """The submaps of a SLAM of one camera: one that is lost goes on in a new submap.
+    """The submaps of a SLAM of one camera: a lost camera continues in a new submap.
 
-    With ``SurfelConfig.submaps`` "off" it stands still until it finds its map again, the only one.
+    With ``SurfelConfig.submaps`` "off" there is one map, and a lost camera waits until it finds it.
     """
 
     saved = ("_ledger", "_search", "_present", "_unmapped", "_expected", "_motion")
@@ -271,9 +270,9 @@ class AtlasSubmaps(Saved):
         self._detached: list[DetachedMap] = []
         self._search = JointSearch()
         self._present = 0
-        self._unmapped = 0  # frames in a row that showed something and were not mapped
+        self._unmapped = 0  # consecutive frames that showed something and were not mapped
         self._motion = np.eye(4)  # of the last tracked frame
-        self._expected = np.eye(4)  # (4, 4) where that takes a camera that is lost
+        self._expected = np.eye(4)  # (4, 4) extrapolated pose of a lost camera
 
     @property
     def _config(self) -> SubmapConfig:
@@ -281,16 +280,16 @@ class AtlasSubmaps(Saved):
 
     @property
     def present(self) -> int:
-        """Number of the submap that frames are tracked in."""
+        """Index of the submap in which frames are tracked."""
         return self._present
 
     @property
     def detached(self) -> Sequence[DetachedMap]:
-        """The maps put aside."""
+        """The maps set aside."""
         return self._detached
 
     def trajectory(self) -> tuple[NDArray[np.int32], Float64]:
-        """Frames (N,) and their poses (N, 4, 4) as the maps have them now."""
+        """Frames (N,) and their poses (N, 4, 4) in the present maps."""
         if not self._ledger.has_several:
             return self._slam.loops.trajectory(0)
         poses: dict[int, Float64] = {}
@@ -301,15 +300,15 @@ class AtlasSubmaps(Saved):
         return np.array(order, dtype=np.int32), stack
 
     def summary(self) -> Submaps:
-        """The submaps as they hang together."""
+        """The submaps and the links between them."""
         return self._ledger.summary()
 
     # -- After every frame ---------------------------------------------------------------------
 
     def follow(self, frames: Images, guess: ArrayLike | None, result: TrackResult) -> TrackResult:
-        """Start a submap after a few refused frames, look for older ones while there are any.
+        """Start a submap after a few refused frames; look for older ones while there are any.
 
-        Returns the result for the frame that was just tracked or not.
+        Returns the result for the frame that was just tracked or refused.
         """
         if not self._is_on:
             return result
@@ -327,7 +326,7 @@ class AtlasSubmaps(Saved):
         return self._labelled(self._after_tracking(frames, result))
 
     def _labelled(self, result: TrackResult) -> TrackResult:
-        """Say which submap the frame is in, and how sure it is where that lies."""
+        """Add the submap of the frame, and the covariance of that submap's pose."""
         if self._present == 0:
             return result
         pose = result.T_world_camera
@@ -357,7 +356,7 @@ class AtlasSubmaps(Saved):
         return self._start(frames, self._link(guess is not None))
 
     def _link(self, is_guessed: bool) -> Float64:
-        """Covariance (6, 6) of where the camera is expected."""
+        """Covariance (6, 6) of the expected camera pose."""
         rules = self._config
         sigmas = np.repeat([rules.guess_sigma_m, np.radians(rules.guess_sigma_deg)], 3)
         if not is_guessed:
@@ -367,7 +366,7 @@ class AtlasSubmaps(Saved):
         return np.diag(sigmas**2)
 
     def _start(self, frames: Images, link: Float64) -> TrackResult:
-        """Put the map aside and start another with this frame."""
+        """Set the map aside and start another with this frame."""
         frame = self._slam.last_frame()
         self._ledger.correct(*self._slam.loops.trajectory(0))
         if len(self._slam.keyframe_poses()) >= self._config.fewest_keyframes:
@@ -400,7 +399,7 @@ class AtlasSubmaps(Saved):
     def _join(
         self, other: DetachedMap, T_other_present: Float64, result: TrackResult
     ) -> TrackResult:
-        """Move the newer map onto the older one, and go on in both as one."""
+        """Move the newer map onto the older one, and continue in the merged map."""
         frame, slam, ledger = self._slam.last_frame(), self._slam, self._ledger
         older, newer = sorted((other.label, self._present))
         is_older_present = older == self._present
@@ -423,7 +422,7 @@ class AtlasSubmaps(Saved):
         return replace(result, T_world_camera=slam.poses[0].copy(), submaps_joined=True)
 
     def get_state(self) -> dict[str, Any]:
-        """Everything, as NumPy arrays and plain values; nothing with submaps "off"."""
+        """The state as NumPy arrays and plain values; empty with submaps "off"."""
         if not self._is_on:
             return {}
         return super().get_state() | {"detached": [each.get_state() for each in self._detached]}
@@ -444,7 +443,7 @@ class AtlasSubmaps(Saved):
         return super().state_like() | like
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state."""
+        """Restore a state of ``get_state``."""
         if not self._is_on:
             return
         super().set_state(state)

@@ -11,21 +11,20 @@ from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M
 
 @dataclass(frozen=True)
 class LoopConfig(Checked):
-    """When loops are looked for, when they are believed, and how the map is deformed.
+    """When to look for loops, when to accept them, and when to deform the map.
 
-    ElasticFusion's published values are for 640x480 at 30 Hz and minutes of recording; these are
-    shares of the image and of the map where they can be, and frames elsewhere.
+    ElasticFusion's published values are for 640x480 at 30 Hz and minutes of recording. These values
+    are shares of the image or of the map where possible, and frames elsewhere.
 
     Attributes:
-        window: frames for which a surfel that is not seen stays active.
-        interval: frames between two looks for a loop.
-        coverage: share of the image that the inactive part of the map must cover.
-        largest_m: largest correction of the camera's position that is believed.
-        smallest_m: a correction that moves a point at 1 m less than this deforms nothing: the
-            inactive surfels are taken back as they are.
-        global_interval: frames between two looks at keyframes; a multiple of ``interval``.
-        drift_share: a keyframe's place is believed if it is no further away than this share of the
-            way since.
+        window: frames for which an unseen surfel stays active.
+        interval: frames between two searches for a loop.
+        coverage: least share of the image that the inactive part of the map must cover.
+        largest_m: largest correction of the camera's position that is accepted.
+        smallest_m: a correction that moves a point at 1 m by less than this deforms nothing; the
+            inactive surfels become active where they are.
+        global_interval: frames between two searches among keyframes; a multiple of ``interval``.
+        drift_share: largest accepted distance to a keyframe, as a share of the path since then.
     """
 
     window: int = bounded(50, 1, 1_000_000)
@@ -39,10 +38,10 @@ class LoopConfig(Checked):
 
 @dataclass(frozen=True)
 class DoubtConfig(Checked):
-    """When a frame that is refused is compared with the map's view from where it was found.
+    """Thresholds from which a refused frame gets a second check against the map's view.
 
-    There it is accepted, uncertain or refused for good; see
-    ``alignment_check.status_on_appeal``.
+    The check renders the map from the pose that was found, and accepts the frame, calls it
+    uncertain, or refuses it; see ``alignment_check.status_on_appeal``.
 
     Attributes:
         inliers: least share of the matched points that are inliers.
@@ -59,16 +58,17 @@ class DoubtConfig(Checked):
 
 @dataclass(frozen=True)
 class AcceptanceConfig(Checked):
-    """When a pixel counts for an alignment with the map, and when a frame's alignment is accepted.
+    """When a pixel fits the map, and when a frame's alignment is accepted.
 
     Attributes:
-        inlier_sigmas: a matched point is an inlier if its residual is less than so many standard
-            deviations of the depth noise. Chosen together with ``inliers``, as
-            ``acceptance_thresholds`` says: at a right pose, Gaussian depth noise as large as
-            ``depth_noise_m`` leaves all points inliers, 2.5 times as large 89 %, 4 times 68 %.
-        conflict_sigmas: its depth conflicts if it is further away than this along the ray.
-        texture: least intensity gradient of a textured point, grey levels per pixel (of the sum of
-            both components).
+        inlier_sigmas: a matched point is an inlier if its residual is below this number of standard
+            deviations of the depth noise. Chosen together with ``inliers``, see
+            ``acceptance_thresholds``: at a right pose, Gaussian depth noise of ``depth_noise_m``
+            leaves all points inliers, 2.5 times as much noise 89 %, 4 times as much 68 %.
+        conflict_sigmas: the depth of a matched point conflicts if it differs along the ray by more
+            than this number of standard deviations.
+        texture: least intensity gradient of a textured point, grey levels per pixel (sum of both
+            components).
         photometric_inlier: largest photometric residual of an inlier, grey levels, at the usual
             scale of residuals.
         points: fewest matched points.
@@ -77,7 +77,7 @@ class AcceptanceConfig(Checked):
         alike: least share of the textured points that are photometric inliers.
         conflicts: largest share of the matched points whose depth conflicts.
         cost: largest mean truncated cost of the visible points, in [0, 3].
-        doubted: laxer values, of frames that are looked at once more.
+        doubted: laxer values, from which a refused frame gets a second check.
     """
 
     inlier_sigmas: float = bounded(4.0, 0.1, 100.0)
@@ -95,21 +95,24 @@ class AcceptanceConfig(Checked):
 
 @dataclass(frozen=True)
 class SubmapConfig(Checked):
-    """When a submap starts, how older ones are looked for, and when two are joined.
+    """When to start a submap, how to find older ones, and when to join two.
 
     Attributes:
-        after: frames in a row that show something and are refused before a submap starts.
-        fewest_keyframes: a map with fewer is forgotten when it is lost.
-        interval: frames between two looks for an older submap.
-        dissimilarity: of a frame and a keyframe that may show the same place, share of the ferns.
-        looks: that must agree on how two submaps lie,
-        step_m: from places this far apart,
-        step_deg: or this far turned, unless ``interval`` frames lie between.
-        agreement_m: they agree if they put the camera no further apart,
-        agreement_deg: and turn it no further.
+        after: a submap starts after this many consecutive frames that show something and are
+            refused.
+        fewest_keyframes: a lost map with fewer keyframes is dropped.
+        interval: frames between two searches for an older submap.
+        dissimilarity: largest dissimilarity of a frame and a keyframe that may show the same place,
+            as a share of the ferns.
+        looks: number of searches that must agree on the relative pose of two submaps.
+        step_m: distance between the places of two such searches, unless ``step_deg`` is met or
+            ``interval`` frames lie between them.
+        step_deg: rotation between two such searches; see ``step_m``.
+        agreement_m: searches agree if their camera positions differ by at most this,
+        agreement_deg: and their rotations by at most this.
         guess_sigma_m: standard deviation of each coordinate of the pose at which a submap starts,
-            as the caller guessed it,
-        guess_sigma_deg: and of its rotation about each axis; larger where there is no guess.
+            if the caller guessed it; larger without a guess.
+        guess_sigma_deg: standard deviation of its rotation about each axis; larger without a guess.
     """
 
     after: int = bounded(5, 1, 1_000_000)
@@ -145,63 +148,63 @@ class SurfelConfig(Checked):
     """Parameters of tracking, fusion and prediction.
 
     Attributes:
-        depth_cutoff_m: readings beyond are ignored; those with more than 48 mm of noise,
-            by default beyond 4 m, count the less the more noise they have.
+        depth_cutoff_m: readings beyond this depth are ignored. Readings with more than 48 mm of
+            noise, by default those beyond 4 m, count less the noisier they are.
         icp_rgb_weight: weight w of the photometric term against the geometric one, [0, 1]: 0 is
             geometry alone, 1 photometry alone; ``normal_equations`` has the exact cost.
         confidence_threshold: observations after which a surfel is stable, [0, 12].
         iterations: Gauss-Newton iterations per pyramid level, finest first.
-        max_surfels: capacity of the map, per env; None for 500,000 with images of up to 160 columns
-            and in proportion to the columns beyond.
-        coverage_px: a reading starts a new surfel only where none of its surface projects this
+        max_surfels: capacity of the map, per env; None: 500,000 for images of up to 160 columns,
+            and in proportion to the columns for wider ones.
+        coverage_px: a reading starts a new surfel only if no surfel of its surface projects this
             close to its pixel.
         surfel_radius_px: radius of a new surfel in pixels of the view that made it.
-        max_confidence: where the confidence of a surfel, the weight of its past, stops growing.
+        max_confidence: limit of a surfel's confidence, which is the weight of its past.
         compaction_interval: frames between two removals of unstable surfels.
-        unstable_window: frames after which a surfel still below the confidence threshold and
-            not seen again is removed.
+        unstable_window: a surfel below the confidence threshold is removed if it is not seen for
+            this many frames.
         fusion_distance_m: largest distance along the ray between a reading and the surfel that
             it updates, at 1 m; grows with depth squared like the sensor's noise.
         fusion_angle_deg: largest angle between their normals.
         bilateral_sigma_m: width of the filter in depth at 1 m; grows with depth squared.
         bilateral_radius_px: half-size of the filter's window, pixels.
-        normal_edge_per_m: a jump of inverse depth between neighbours (of a 160-column image)
-            beyond which there is an edge and no normal, 1/m.
+        normal_edge_per_m: a larger jump of inverse depth between neighbours (of a 160-column image)
+            is an edge and has no normal, 1/m.
         icp_distance_m: largest distance between associated points in tracking.
         icp_angle_deg: largest angle between their normals.
         depth_noise_m: axial noise of depth at 1 m, grows with depth squared; the unit of
             geometric residuals.
         cauchy_icp: scale of Cauchy's loss on geometric residuals, in units of that noise.
-        cauchy_rgb: the same for photometric residuals.
+        cauchy_rgb: scale of Cauchy's loss on photometric residuals, in standard deviations.
         intensity_noise: standard deviation of a grey value, grey levels.
-        points_per_level: the last iteration of tracking looks at about this many pixels; the
-            others at three tenths of that.
+        points_per_level: pixels in the last iteration of tracking, about; the other iterations use
+            three tenths of that.
         refuse_bad_fits: whether a frame that fits the map badly counts as lost and stays out of the
             map. If not, every frame is fused at the pose that alignment found, as in ElasticFusion
-            without relocalisation, and a map may show things twice.
+            without relocalisation, and the map may show things twice.
         acceptance: which pixels and frames fit the map.
-        loop_closure: "none": frames are aligned with all of the map, however old; "deformation":
-            with its recent part; where that meets the old part again the map is deformed to fit.
-        loops: parameters of the latter.
-        relocalisation: where a lost frame is searched besides around the last good pose: "ferns",
-            at keyframes that resemble it, "features", where their ORB features put it if that leads
-            nowhere, or "local", nowhere.
-        submaps: "atlas": a camera whose frames stay out of the map goes on in a new one, which is
-            joined to the old one where that is seen again; "off": it waits. Of several cameras in
-            lockstep each waits.
-        submap_rules: parameters of the former.
-        motion_mask: "geometric": what moves is neither tracked nor mapped, see ``free_space_mask``;
-            "none": the world is taken to be still.
+        loop_closure: "none": align frames with the whole map, however old; "deformation": align
+            them with its recent part, and deform the map where that meets the old part again.
+        loops: parameters of "deformation".
+        relocalisation: where to search for a lost frame, besides around the last good pose:
+            "ferns": at similar keyframes; "features": the same, and then where ORB features put
+            it; "local": nowhere else.
+        submaps: "atlas": a lost camera continues in a new map, which is joined to the old one
+            when that is seen again; "off": it waits until it finds its map. With several cameras in
+            lockstep, a lost one always waits.
+        submap_rules: parameters of "atlas".
+        motion_mask: "geometric": moving things are neither tracked nor mapped, see
+            ``free_space_mask``; "none": the world is assumed to be static.
         readout_s: time that a rolling shutter takes from the first row to the last, see
-            ``rolling_shutter``; 0: all rows are taken at once. It takes frames with their times.
-        check_slips: whether a frame that fits worse than is usual, or leaves a direction open, is
-            aligned anew at the finest level alone, from where features put it too; see
-            ``Localizer``.
-        refuse_open: with ``check_slips``, whether what stays open is refused: for a camera that can
-            go back to where its pose was known.
-        color_registration: "estimated": where the colour camera is, is found from the edges of the
-            first frames, see ``color_cameras``; "given": colour is taken as it comes. Of several
-            cameras in lockstep it is.
+            ``rolling_shutter``; 0: all rows are exposed at once. Needs frames with timestamps.
+        check_slips: whether a frame that fits worse than usual, or leaves a direction
+            unconstrained, is aligned again at the finest level only, also from where features put
+            it; see ``Localizer``.
+        refuse_open: with ``check_slips``, whether a frame that still leaves a direction
+            unconstrained is refused; for a camera that can return to where its pose was known.
+        color_registration: "estimated": estimate the offset of the colour camera from edges in the
+            first frames, see ``color_cameras``; "given": use colour as it comes. With several
+            cameras in lockstep, colour is always used as it comes.
     """
 
     depth_cutoff_m: float = bounded(8.0, 0.0, LARGEST_CUTOFF_M)
@@ -247,9 +250,9 @@ class SurfelConfig(Checked):
     def paper(cls) -> SurfelConfig:
         """ElasticFusion as the paper explores it (ICRA 2017, section IV-A): ``PAPER``'s defaults.
 
-        Its loops are closed by deforming the map, and what was added here is off. The other
-        parameters have no published value in units of ours and stay as they are;
-        docs/exploration.md goes through them.
+        Loops are closed by deforming the map, and our own additions are off. The other parameters
+        have no published values in our units and keep their defaults; docs/exploration.md lists
+        them.
         """
         published = {name: default for name, (default, _, _) in PAPER.items()}
         own = {"motion_mask": "none", "submaps": "off", "check_slips": False}
@@ -257,11 +260,14 @@ class SurfelConfig(Checked):
 
     @classmethod
     def of_mapper(cls, **options: Any) -> SurfelConfig:
-        """Only maps, at the poses of another backend, whose errors would seem to be motion."""
+        """For mapping at poses of another backend: no mask, which would take its errors for motion.
+
+        ``options`` are further parameters.
+        """
         return cls(**{"motion_mask": "none", "submaps": "off", **options})
 
     def capacity(self, columns: int) -> int:
-        """Surfels that the map of a camera with images of so many columns has room for."""
+        """Capacity of the map, in surfels, for images of ``columns`` columns."""
         if self.max_surfels is not None:
             return self.max_surfels
         return round(500_000 * max(1.0, columns / 160))

@@ -1,8 +1,8 @@
 """The surfel maps of B envs: fuse frames, render the model, predict views, save and restore.
 
-A removed surfel is dead: it keeps its slot, and nothing sees it. The gaps are closed when they are
-many. A crowded map forgets what was not seen for longest, so much at a time that there is room for
-some frames, not all that is out of view: it may be all that a camera has mapped.
+A removed surfel is dead: it keeps its slot, and nothing uses it. Compaction removes dead slots when
+there are many. A crowded map forgets the surfels that were unseen for longest, enough to make room
+for some frames. It does not forget everything out of view, which may be all that a camera mapped.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ FORGOTTEN = wp.constant(16)  # a sixteenth of a crowded map's slots at once
 
 @wp.struct
 class CullingRule:
-    """When surfels go."""
+    """When surfels are removed."""
 
     capacity: int  # slots of a map
     interval: int  # frames between two removals of unstable surfels
@@ -83,7 +83,7 @@ def is_crowded(slots: int, capacity: int) -> bool:
 
 @wp.func
 def age_span(rule: CullingRule, time: int) -> int:
-    """Frames that the ages of unstable surfels are counted over."""
+    """Number of frames over which the ages of unstable surfels are counted."""
     return wp.max(wp.min(rule.window, time), 1)
 
 
@@ -91,7 +91,7 @@ def age_span(rule: CullingRule, time: int) -> int:
 def count_ages(
     surfels: Surfels, rule: CullingRule, frame: FusedFrame, workers: int, ages: SurfelAges
 ) -> None:
-    """Count the unstable surfels of crowded maps by the frame that saw them last."""
+    """Count the unstable surfels of crowded maps by the frame that last saw them."""
     b, worker = wp.tid()
     time = frame.time[b]
     count = wp.min(surfels.count[b], rule.capacity)
@@ -110,9 +110,9 @@ def count_ages(
 
 @wp.func
 def oldest_that_stay(ages: SurfelAges, rule: CullingRule, b: int, time: int) -> int:
-    """The frame from which on unstable surfels stay in a crowded map.
+    """First frame such that unstable surfels seen since then stay in a crowded map.
 
-    As many have not been seen since as must go, or all that are not in view.
+    The surfels not seen since then are as many as must go, or all that are out of view.
     """
     gone = wp.int32(0)
     k = wp.int32(0)
@@ -133,11 +133,11 @@ def cull_unstable(
     compaction: Compaction,
     ages: SurfelAges,
 ) -> None:
-    """Let the unstable surfels die that were not seen for long, every ``interval`` frames.
+    """Remove unstable surfels that were unseen for long, every ``interval`` frames.
 
-    In a map whose living surfels take nine tenths of the slots, at once and whatever their age
-    those of them that were not seen for longest: a sixteenth of the slots, if there are so many out
-    of view. Only the blocks are looked at that hold such surfels.
+    If living surfels take nine tenths of the slots, remove those unseen for longest at once,
+    whatever their age: a sixteenth of the slots, or all that are out of view if they are fewer.
+    Only blocks that hold such surfels are visited.
     """
     b, worker = wp.tid()
     count = wp.min(surfels.count[b], rule.capacity)
@@ -174,8 +174,8 @@ def list_survivors(
 ) -> None:
     """List the slots to keep of every env whose compaction is due; ``kept`` -1: not due.
 
-    It is due when many slots are dead, so that its cost follows the number of deaths: an eighth, or
-    in a crowded map a sixty-fourth and as many as are free.
+    It is due when more than an eighth of the slots are dead; in a crowded map, when more than a
+    sixty-fourth are and the dead outnumber the free. So its cost is proportional to the deaths.
     """
     b, worker = wp.tid()
     count = wp.min(surfels.count[b], rule.capacity)
@@ -257,8 +257,8 @@ def forget_surfels(envs: wp.array[wp.int32], surfels: Surfels, blocks: CullingBl
 class MapKernels:
     """Recorded launches for frames of one size under one configuration.
 
-    One map may have several: a running SLAM that changes its parameters or the size of its images
-    works on the same surfels with other kernels.
+    One map may have several: a running SLAM that changes its parameters or image size works on the
+    same surfels with other kernels.
     """
 
     def __init__(
@@ -334,7 +334,7 @@ class MapKernels:
         ]
 
     def model_renderer(self, stride: int, window: SeenWindow) -> SplatRenderer:
-        """Renders every ``stride``-th row and column of what was last seen within ``window``."""
+        """A renderer of every ``stride``-th row and column, for surfels last seen in ``window``."""
         drawn = self.splat_parameters
         drawn = replace(drawn, min_px=drawn.min_px / stride, max_px=drawn.max_px / stride)
         intrinsics = self._intrinsics.every_nth(stride)
@@ -362,14 +362,14 @@ class MapKernels:
             launch.launch()
 
     def bound_blocks(self) -> None:
-        """Look at the surfels of all blocks that are not bounded."""
+        """Compute the bounding boxes of all blocks without a valid one."""
         for launch in self._bound:
             launch.launch()
 
     def _bind(
         self, live: LiveFrame, poses: wp.array, time: wp.array, weight: wp.array, mask: wp.array
     ) -> None:
-        """Make these the arguments of the recorded launches, if they are not already."""
+        """Set the arguments of the recorded launches, if they have changed."""
         arguments = (live, poses, time, weight, mask)
         if all(new is old for new, old in zip(arguments, self._arguments, strict=True)):
             return
@@ -386,8 +386,8 @@ class SurfelMap(Stateful):
 
     ``fuse`` and ``render_model`` work on the surfels last seen within ``active``: all, unless its
     times are set. ``render_model`` draws every ``model_stride``-th row and column of the image.
-    ``workers`` threads share one env's surfels; None: 1 on the CPU, where they run one after the
-    other and the results keep the order of the map, many on a GPU.
+    ``workers`` threads share one env's surfels; None: many on a GPU, and 1 on the CPU, where
+    threads run in turn and a single one keeps results in the order of the map.
     """
 
     def __init__(
@@ -417,21 +417,21 @@ class SurfelMap(Stateful):
     def make_kernels(
         self, intrinsics: Intrinsics, config: SurfelConfig, model_stride: int
     ) -> MapKernels:
-        """Kernels for frames of another size or with other parameters; ``use`` puts them in force.
+        """Kernels for frames of another size or for other parameters; ``use`` activates them.
 
-        The capacity of the map stays what it is.
+        The capacity of the map does not change.
         """
         return MapKernels(self._buffers, intrinsics, config, model_stride)
 
     def use(self, kernels: MapKernels) -> None:
-        """Go on with other kernels; views are predicted at the sizes of before."""
+        """Continue with other kernels; predicted views keep their size."""
         before, after = self.config, kernels.config
         self.kernels = kernels
         if before.confidence_threshold != after.confidence_threshold:
-            self.surfels_moved()  # which surfels may expire is a matter of the threshold
+            self.surfels_moved()  # the threshold decides which surfels may expire
 
     def model_renderer(self, stride: int, window: SeenWindow) -> SplatRenderer:
-        """Renders every ``stride``-th row and column of what was last seen within ``window``."""
+        """A renderer of every ``stride``-th row and column, for surfels last seen in ``window``."""
         return self.kernels.model_renderer(stride, window)
 
     def clear(self, envs: ArrayLike | None = None) -> None:
@@ -449,14 +449,14 @@ class SurfelMap(Stateful):
         Args:
             live: the frames.
             poses: (B,) mat44 T_world_camera.
-            time: (B,) int32 number of the frame in its episode.
+            time: (B,) int32 index of the frame in its episode.
             weight: (B,) float32 in (0, 1], lower for a fast camera (Whelan et al., section 3).
             mask: (B,) int32, 0 leaves an env's map as it is.
         """
         self.kernels.fuse(live, poses, time, weight, mask)
 
     def surfels_moved(self) -> None:
-        """Look at all surfels anew: something else than ``fuse`` has changed them."""
+        """Recompute the culling blocks; call it when anything but ``fuse`` has changed surfels."""
         self._buffers.blocks.bounded.zero_()
         self._buffers.blocks.num_listed.zero_()
         self.kernels.bound_blocks()
@@ -464,8 +464,8 @@ class SurfelMap(Stateful):
     def render_model(self, poses: wp.array) -> ModelView:
         """Render every env's map from its pose (B,) mat44 T_world_camera.
 
-        With every ``model_stride``-th row and column, from the first on. The images are
-        overwritten by the next call.
+        The view holds every ``model_stride``-th row and column, from the first on. The next call
+        overwrites its images.
         """
         return self.kernels.render_model(poses)
 
@@ -476,8 +476,8 @@ class SurfelMap(Stateful):
 
         Args:
             poses: (E, N, 4, 4) T_world_camera of N views for each of E envs.
-            scale: of the predicted images relative to the live ones.
-            first_env: the E envs are those from this one on.
+            scale: size of the predicted images relative to the live ones.
+            first_env: index of the first of the E envs.
 
         Returns:
             Images (E * N, h, w), overwritten by the next call.
@@ -496,11 +496,11 @@ class SurfelMap(Stateful):
         )
 
     def count(self, env: int = 0) -> int:
-        """Living surfels of one env."""
+        """Number of living surfels of one env."""
         return int(self.surfels.count.numpy()[env] - self.surfels.dead.numpy()[env])
 
     def points(self, env: int = 0, stable: bool = True) -> Float64:
-        """Positions (M, 3) of the living surfels, world frame; only stable ones if asked."""
+        """Positions (M, 3) of the living surfels, world frame; only stable ones if ``stable``."""
         return self.attribute("position", env, stable).astype(np.float64)
 
     def colors(self, env: int = 0, stable: bool = True) -> NDArray[np.uint8]:
@@ -517,7 +517,7 @@ class SurfelMap(Stateful):
         return getattr(self.surfels, name)[env, :used].numpy()[keep]
 
     def get_state(self) -> dict[str, Any]:
-        """Everything needed to go on bit-exactly: per env, the used part of every array."""
+        """Everything needed to continue bit-exactly: per env, the used part of every array."""
         counters = {name: getattr(self.surfels, name).numpy().copy() for name in COUNTERS}
         return {
             "counters": counters,
@@ -530,7 +530,7 @@ class SurfelMap(Stateful):
         return Fields(like, self._why_wrong)
 
     def surfels_like(self) -> dict[str, ArrayOf]:
-        """What ``get_surfels`` gives."""
+        """Description of what ``get_surfels`` returns; see ``Stateful.state_like``."""
         return {
             name: ArrayOf(values.dtype, ("surfels", *values.shape[1:]), *_RANGES.get(name, _FREE))
             for name, values in self.get_surfels(0).items()
@@ -542,7 +542,7 @@ class SurfelMap(Stateful):
         return {name: getattr(self.surfels, name)[env, :used].numpy().copy() for name in ATTRIBUTES}
 
     def set_surfels(self, env: int, arrays: dict[str, NDArray[Any]]) -> None:
-        """Make these the surfels of one env; what does not fit into the map is dropped."""
+        """Replace the surfels of one env; those beyond the map's capacity are dropped."""
         capacity = self._buffers.capacity
         total = len(arrays["confidence"])
         used = min(total, capacity)
@@ -558,7 +558,7 @@ class SurfelMap(Stateful):
             _write(getattr(self.surfels, name), env, arrays[name])
 
     def check_fits(self, state: dict[str, Any]) -> None:
-        """Refuse a state with more surfels than there is room for.
+        """Refuse a state with more surfels than the map's capacity.
 
         Raises:
             InputError: naming both numbers.
@@ -572,7 +572,7 @@ class SurfelMap(Stateful):
         return f"has {most} surfels; there is room for {room}" if most > room else ""
 
     def _why_wrong(self, state: dict[str, Any]) -> str:
-        """What is wrong between the counters of a state, its surfels and the room for them."""
+        """Error message if the counters of a state do not fit its surfels or the capacity."""
         used = [len(one["confidence"]) for one in state["surfels"]]
         dead = [np.count_nonzero(one["confidence"] == 0) for one in state["surfels"]]
         counters = state["counters"]
@@ -581,7 +581,7 @@ class SurfelMap(Stateful):
         return self._why_too_large(state)
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state that ``get_state`` of a map of this size returned."""
+        """Restore a state that ``get_state`` of a map of this size returned."""
         for name in COUNTERS:
             getattr(self.surfels, name).assign(state["counters"][name])
         for env, arrays in enumerate(state["surfels"]):
@@ -591,7 +591,7 @@ class SurfelMap(Stateful):
 
 _FREE: tuple[float | None, float] = None, math.inf
 _RANGES: dict[str, tuple[float | None, float]] = {
-    "color": (-1e4, 1e4),  # in the first exposure: those of later ones may leave [0, 255]
+    "color": (-1e4, 1e4),  # at the first exposure; colours of later ones may leave [0, 255]
     **dict.fromkeys(("radius", "confidence"), (0.0, math.inf)),
     **dict.fromkeys(("created", "seen"), (0, math.inf)),
 }
@@ -599,7 +599,7 @@ _RANGES: dict[str, tuple[float | None, float]] = {
 
 def _write(array: wp.array, env: int, values: NDArray[Any]) -> None:
     """Write the first ``len(values)`` elements of one env's row."""
-    if wp.get_device(array.device).is_cpu:  # a view: ``assign`` costs five times as much
+    if wp.get_device(array.device).is_cpu:  # write through a view; ``assign`` costs 5 times more
         array.numpy()[env, : len(values)] = values
     elif len(values):
         array[env, : len(values)].assign(values)

@@ -1,22 +1,22 @@
 # mypy: disable-error-code="empty-body"
 # ruff: noqa: UP018, RUF046
-"""Fusing a live frame into the map: surfels are averaged with its readings, and new ones start.
+"""Fuse a live frame into the map: average surfels with its readings, and start new ones.
 
 Association is projective (Keller et al., 3DV 2013, section 4), but from the surfel to the image:
-each visible surfel looks at the four readings around its projection, so its position in the image
-is kept to a fraction of a pixel and no surfel hides another from being updated. That is the limit
-of the papers' index image of higher and higher resolution, and needs no index image. A reading
-starts a new surfel only where no surfel of the same surface projects close to it: an already mapped
-point, seen again with noise or from between the old pixels, makes no second surfel.
+each visible surfel looks at the four readings around its projection. So its position in the image
+is exact to a fraction of a pixel, and no surfel hides another from being updated. The papers' index
+image approaches this as its resolution grows; here none is needed. A reading starts a new surfel
+only if no surfel of the same surface projects close to it, so a mapped point that is seen again,
+with noise or between the old pixels, makes no second surfel.
 
-On the CPU the work on a surfel is some hundred operations with few decisions: one surfel after the
-other takes several times as long as eight at a time. So the rule is written as short loops over a
-few surfels, whose intermediate values are local arrays: the compiler turns those without branches
-into operations on eight surfels. On a GPU every thread takes one surfel at a time, and the loops
-and arrays vanish.
+On the CPU, a surfel takes about a hundred operations and few branches; one surfel at a time takes
+several times as long as eight at a time. So the rule is written as short loops over a few surfels
+with local arrays for intermediate values, and the compiler vectorizes the loops without branches
+over eight surfels. On a GPU every thread takes one surfel at a time, and the loops and arrays
+vanish.
 
-A CPU also waits for memory. There the surfels of a few blocks are culled and updated before the
-next ones are looked at, so that they are fetched once.
+A CPU also waits for memory. So the surfels of a few blocks are culled and updated before the next
+blocks are read, and each is fetched once.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from ms_slam_env.slam.surfel.surfels import (
     translation_of,
 )
 
-COARSER = wp.constant(1.5)  # a reading with a radius this much larger refines nothing (Keller)
-FULL_WEIGHT_SIGMA_M = 0.048  # readings with more noise weigh less; the default's at 4 m
+COARSER = wp.constant(1.5)  # a reading whose radius is this factor larger is ignored (Keller)
+FULL_WEIGHT_SIGMA_M = 0.048  # readings with more noise weigh less; reached at 4 m by default
 STEEPEST = wp.constant(0.3)  # cosine of the view angle below which radii no longer grow
 
 
@@ -52,24 +52,24 @@ class FusionParameters:
     min_cosine: float  # of the angle between the normals of a surfel and a reading
     coverage_px: float  # a surfel this close to a pixel covers it
     radius_px: float  # radius of a new surfel, in pixels of the view that made it
-    max_confidence: float  # where confidence, the weight of the past, stops growing
-    full_m: float  # readings further away weigh less, by their variance
+    max_confidence: float  # limit of the confidence, which is the weight of the past
+    full_m: float  # readings beyond this depth weigh less, by their variance
 
 
 @wp.struct
 class FusedFrame:
-    """The frames that are fused, images flat; poses, time, weight and mask are (B,)."""
+    """The frames to fuse, images flat; poses, time, weight and mask are (B,)."""
 
     poses: wp.array[wp.mat44]  # T_world_camera
     mask: wp.array[wp.int32]  # 0 leaves an env's map as it is
-    time: wp.array[wp.int32]  # number of the frame in its episode
+    time: wp.array[wp.int32]  # index of the frame in its episode
     weight: wp.array[wp.float32]  # in (0, 1], lower for a fast camera
     depth: wp.array[wp.float32]  # (B * H * W) metres
     normals: wp.array[wp.vec3]  # camera frame
     color: wp.array[wp.vec3]  # RGB
     radial: wp.array[wp.float32]  # (H * W) weights of the pixels
     covered: wp.array[wp.int32]  # 1 where a surfel of the map covers the pixel
-    moving: wp.array[wp.int32]  # 1 where something moves, which is no part of the map
+    moving: wp.array[wp.int32]  # 1 where something moves, which is not mapped
 
 
 CENTRALITY = 1.0 / (2.0 * 0.6 * 0.6)  # of the radial weight, Keller section 4.1
@@ -90,7 +90,7 @@ def range_weight(z: float, full_m: float) -> float:
 
 
 def radial_weights(height: int, width: int) -> NDArray[np.float32]:
-    """Gaussian (H, W) of the distance to the centre over half the diagonal (Keller, 4.1)."""
+    """Gaussian weights (H, W) of distance to the centre over half the diagonal (Keller, 4.1)."""
     v, u = np.mgrid[:height, :width]
     squared = (u - 0.5 * (width - 1)) ** 2 + (v - 0.5 * (height - 1)) ** 2
     return np.exp(-CENTRALITY * squared / (0.25 * (width**2 + height**2))).astype(np.float32)
@@ -107,7 +107,7 @@ def add_surfels(
 ) -> None:
     """Start a surfel at every uncovered, unmoving reading with a normal; a full map drops it.
 
-    ``count`` runs past the capacity when surfels are dropped; ``put_back`` sets it right.
+    ``count`` exceeds the capacity when surfels are dropped; ``put_back`` corrects it.
     """
     b, worker = wp.tid()
     if frame.mask[b] == 0:
@@ -163,7 +163,7 @@ def update_some(
     parameters: FusionParameters,
     frame: FusedFrame,
 ) -> int:
-    """Update the listed surfels from ``first`` on, at most to ``end``; how many those were."""
+    """Update listed surfels from ``first`` on, at most to ``end``; return their number."""
 
 
 @wp.kernel
@@ -175,11 +175,11 @@ def update_surfels(
     frame: FusedFrame,
     workers: int,
 ) -> None:
-    """Average each visible surfel with the readings about its projection; mark covered pixels.
+    """Average each visible surfel with the readings around its projection; mark covered pixels.
 
-    A surfel in front of all four readings contradicts free space, one on a reading of what moves
-    was mapped before it was known to move, one whose normal disagrees contradicts the surface: all
-    lose confidence and die at zero.
+    Three kinds of surfels lose confidence, and die at zero: those in front of all four readings,
+    where space is free; those on a moving reading, mapped before it was known to move; and those
+    whose normal contradicts the surface.
     """
     b, worker = wp.tid()
     if frame.mask[b] == 0:
@@ -202,9 +202,9 @@ def cull_and_update(
     parameters: FusionParameters,
     frame: FusedFrame,
 ) -> None:
-    """``cull`` and ``update_surfels`` in turns, a few blocks at a time; for a single worker.
+    """Alternate ``cull`` and ``update_surfels``, a few blocks at a time; for a single worker.
 
-    The list is working memory: what it holds in the end is of no use.
+    The list is working memory; its final contents have no meaning.
     """
     b = wp.tid()
     if frame.mask[b] == 0:

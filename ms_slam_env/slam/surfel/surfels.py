@@ -1,4 +1,4 @@
-"""The surfels of B maps and what is kept about them, as structures of device arrays."""
+"""The surfels of B maps and their bookkeeping, as structures of device arrays."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from ms_slam_env._runtime.warp import roomy_zeros
 from ms_slam_env.errors import InputError
 
 BLOCK_SIZE = wp.constant(128)
-"""Surfels of a culling block."""
+"""Number of surfels in a culling block."""
 NUM_AGES = 256
-"""Ages that unstable surfels are sorted into where some must go."""
+"""Number of age bins for the unstable surfels of a crowded map."""
 EARLIEST = -(2**31)
 LATEST = 2**31 - 1
-"""Bounds of a ``SeenWindow`` that leaves out nothing."""
-GPU_THREADS = 1 << 20  # of a launch, about
+"""Bounds of a ``SeenWindow`` that excludes nothing."""
+GPU_THREADS = 1 << 20  # approximate number per launch
 GPU_WORKERS = (256, 8192)  # fewest and most that share one env's surfels
 
 
@@ -61,17 +61,17 @@ class CullingBlocks:
 
     low: wp.array2d[wp.vec3]  # lower corner of the bounding box, world frame
     high: wp.array2d[wp.vec3]  # upper corner
-    # frame that saw the block's longest unseen unstable surfel; the largest number if all are
+    # frame that last saw the block's longest unseen unstable surfel; the largest integer if all are
     # stable or dead.
     expiry: wp.array2d[wp.int32]
     listed: wp.array2d[wp.int32]  # blocks that a camera may see
-    num_listed: wp.array[wp.int32]  # (B,) how many those are
-    bounded: wp.array[wp.int32]  # (B,) slots whose blocks have a box that holds
+    num_listed: wp.array[wp.int32]  # (B,) number of listed blocks
+    bounded: wp.array[wp.int32]  # (B,) number of slots whose blocks have a valid box
 
 
 @wp.struct
 class SplatFootprints:
-    """The surfels of a list in the image, arrays (B, capacity), and those that meet a pixel."""
+    """Footprints of a list's surfels in the image, arrays (B, capacity), and the drawn ones."""
 
     u: wp.array2d[wp.float32]  # column of the centre
     v: wp.array2d[wp.float32]  # row of the centre
@@ -84,8 +84,8 @@ class SplatFootprints:
     right: wp.array2d[wp.int32]  # last column
     top: wp.array2d[wp.int32]  # first row
     bottom: wp.array2d[wp.int32]  # last row
-    drawn: wp.array2d[wp.int32]  # places in the list of the discs that may cover a pixel
-    num_drawn: wp.array[wp.int32]  # (B,) how many those are
+    drawn: wp.array2d[wp.int32]  # list indices of the discs that may cover a pixel
+    num_drawn: wp.array[wp.int32]  # (B,) number of these discs
 
 
 @wp.struct
@@ -93,27 +93,27 @@ class Compaction:
     """Working memory of ``surfel_map``."""
 
     survivors: wp.array2d[wp.int32]  # (B, capacity) slots to keep
-    kept: wp.array[wp.int32]  # (B,) how many those are, -1 where no compaction is due
+    kept: wp.array[wp.int32]  # (B,) number of survivors, -1 if no compaction is due
     expired: wp.array[wp.int32]  # (B,) surfels that died just now
 
 
 @wp.struct
 class SurfelAges:
-    """How many unstable surfels of a crowded map are how old, see ``surfel_map``."""
+    """Age histogram of the unstable surfels of crowded maps, see ``surfel_map``."""
 
-    count: wp.array2d[wp.int32]  # (B, NUM_AGES) the oldest first
+    count: wp.array2d[wp.int32]  # (B, NUM_AGES), the oldest first
 
 
 @wp.struct
 class SeenWindow:
-    """Which surfels of B maps take part, by the frame that saw them last."""
+    """Selects surfels of B maps by the frame that last saw them."""
 
     seen_from: wp.array[wp.int32]  # (B,) first frame
     seen_to: wp.array[wp.int32]  # (B,) last frame
 
 
 def any_time(batch: int, device: str) -> SeenWindow:
-    """Window that leaves out no surfel of ``batch`` maps."""
+    """Window that excludes no surfel of ``batch`` maps."""
     window = SeenWindow()
     window.seen_from = wp.full(batch, EARLIEST, dtype=wp.int32, device=device)
     window.seen_to = wp.full(batch, LATEST, dtype=wp.int32, device=device)
@@ -121,7 +121,7 @@ def any_time(batch: int, device: str) -> SeenWindow:
 
 
 def allocate(struct: Any, batch: int, size: int, device: str) -> Any:
-    """Zeros for all arrays of a struct: (B, size), or (B,) where they have one dimension."""
+    """Allocate zeros for all arrays of a struct: (B, size), or (B,) for one-dimensional ones."""
     arrays = struct()
     for name, member in struct.vars.items():
         shape = (batch, size)[: member.type.ndim]
@@ -130,13 +130,13 @@ def allocate(struct: Any, batch: int, size: int, device: str) -> Any:
 
 
 class MapBuffers:
-    """Device arrays of B maps, empty at first, which all that works on these maps shares."""
+    """Device arrays of B maps, empty at first, shared by all users of these maps."""
 
     def __init__(self, batch: int, capacity: int, device: str, workers: int | None = None) -> None:
-        """Make room for maps.
+        """Allocate the arrays.
 
         Raises:
-            InputError: there is none for so many surfels.
+            InputError: there is not enough memory for ``capacity`` surfels.
         """
         try:
             self._make_room(batch, capacity, device, workers)
@@ -155,7 +155,7 @@ class MapBuffers:
         self.footprints: SplatFootprints = allocate(SplatFootprints, *of_surfels)  # of such a list
         self._make_compaction()
         self.ages: SurfelAges = allocate(SurfelAges, batch, NUM_AGES, device)
-        # What frames are tracked against and fused into: all, unless its times are set.
+        # Surfels that frames are tracked against and fused into: all, unless its times are set.
         self.active = any_time(batch, device)
 
     def _make_compaction(self) -> None:
@@ -180,7 +180,7 @@ class MapBuffers:
 
 
 def default_workers(batch: int, device: str) -> int:
-    """Threads that share one env's surfels: 1 on the CPU, which runs one after the other."""
+    """Number of threads that share one env's surfels; 1 on the CPU, which runs them in turn."""
     if wp.get_device(device).is_cpu:
         return 1
     fewest, most = GPU_WORKERS
@@ -222,7 +222,7 @@ class SplatCamera:
     tolerance_m: float  # discs this far behind the nearest one belong to the same surface (at 1 m)
     min_px: float  # smallest drawn radius
     max_px: float  # largest drawn radius
-    max_weight: float  # confidence above which a disc weighs no more
+    max_weight: float  # confidence above which a disc's weight stops growing
 
 
 @wp.func

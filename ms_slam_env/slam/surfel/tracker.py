@@ -64,7 +64,7 @@ class HypothesisBuffers:
         self._state_on_host = arrays.state.numpy() if is_cpu else None  # shares the memory
 
     def running(self) -> bool:
-        """Whether a hypothesis may still move; on a GPU always True: asking would mean waiting."""
+        """Whether a hypothesis may still move; always True on a GPU, where asking would stall."""
         return self._state_on_host is None or bool((self._state_on_host == RUNNING).any())
 
 
@@ -72,7 +72,7 @@ class GaussNewton:
     """Moves pose hypotheses of B envs towards the minimum of the cost, level by level.
 
     Attributes:
-        at_once: whether one launch makes all iterations of a level, as a CPU likes it.
+        at_once: whether one launch makes all iterations of a level, which is faster on a CPU.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class GaussNewton:
         return -(-height // stride) * -(-width // min(self._columns, width))
 
     def set_images(self, live: Sequence[Level], model: Sequence[Level]) -> None:
-        """Align these, a level each; the launches recorded for other arrays are forgotten."""
+        """Set the images to align, one per level; drop launches recorded for other arrays."""
         if not (_are_same(live, self._live) and _are_same(model, self._model)):
             self._launches.clear()
         self._live, self._model = live, model
@@ -113,10 +113,10 @@ class GaussNewton:
         count: int,
         ends_with_sums: bool = False,
     ) -> None:
-        """At most ``count`` iterations at one level on every ``stride``-th row and column.
+        """Make at most ``count`` iterations at one level on every ``stride``-th row and column.
 
-        Hypotheses that converged wake in the end. The sums are then those where the last step
-        started, or, if asked for, where it led to.
+        Converged hypotheses become active again at the end. The sums are those before the last
+        step or, if asked for, after it.
         """
         key = (level, stride, id(hypotheses))
         if self.at_once:
@@ -216,23 +216,23 @@ def weights_of(config: SurfelConfig, level: int) -> Weights:
 
 SEARCH_POINTS = 400
 SEARCH_ITERATIONS = 5
-GOOD_SCORE = 0.4  # of a first hypothesis, which makes the other hypotheses needless
+GOOD_SCORE = 0.4  # score of a first hypothesis that makes the others unnecessary
 FINE_ITERATIONS = 11  # without the coarser levels
-SPARSE = 0.3  # share of the points that all iterations but the last look at
+SPARSE = 0.3  # share of the points used by all iterations but the last
 
 
 def model_stride(intrinsics: Intrinsics, config: SurfelConfig) -> int:
-    """Every how many-th row and column of the model view tracking looks at: 1, 2 or 4.
+    """Step between the rows and columns of the model view that tracking uses: 1, 2 or 4.
 
-    The others need not be drawn. Coarse levels lose the mean of 2x2 pixels that the live image
-    has there; discs overlap, so the model's view is smooth already.
+    The others need not be drawn. Unlike the live image, coarse levels then lack the mean of 2x2
+    pixels; discs overlap, so the model's view is smooth already.
     """
     stride = _point_stride(intrinsics.shape, config.points_per_level)
     return max(s for s in (1, 2, 4) if s <= stride)
 
 
 def _point_stride(shape: tuple[int, int], points: float) -> int:
-    """Step between rows and columns that picks about so many pixels of an image."""
+    """Step between rows and columns that picks about ``points`` pixels of an image."""
     return max(1, round((shape[0] * shape[1] / points) ** 0.5))
 
 
@@ -370,9 +370,9 @@ class Tracker:
         self._more.poses.write(hypotheses[:, NUM_FIRST:])
 
     def _search(self) -> None:
-        """Align hypotheses at the coarsest level on few points; the best one goes on.
+        """Align hypotheses at the coarsest level on few points; select the best one.
 
-        Most frames need the first hypotheses only; the others run where those fit badly.
+        Most frames need only the first hypotheses; the others run if those fit badly.
         """
         first, more, one = self._first, self._more, self._one
         self._settle(first)

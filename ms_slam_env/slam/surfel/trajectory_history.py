@@ -1,4 +1,4 @@
-"""The frames of one env, their poses and what each showed; maps put aside, moved and made one."""
+"""The frame history of one env, with poses and anchors; maps set aside, moved and merged."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from ms_slam_env.slam.surfel.map_deformation import Constraints, Deformation, no
 from ms_slam_env.slam.surfel.surfel_map import SurfelMap
 
 ANCHORS = 12  # points of the map that hold a frame's pose
-KEPT_CONSTRAINTS = 1000  # relative ones, of the newest loops
+KEPT_CONSTRAINTS = 1000  # newest relative constraints of loops
 _CONSTRAINT_ARRAYS = ("sources", "source_times", "targets", "target_times")
 
 
 @dataclass
 class TrajectoryHistory(Saved):
-    """What is remembered of one env."""
+    """Fused frames of one env and the loops that it closed."""
 
     frames: list[int] = field(default_factory=list)  # the frames fused
-    # (4, 4) of each, moved by every closure since.
+    # (4, 4) of each frame, moved by later loop closures.
     poses: list[Float64] = field(default_factory=list)
-    # (ANCHORS, 3) points of the map in view of each, moved likewise: a pose keeps its place
-    # relative to what it saw, which is metres away and may be far older.
+    # (ANCHORS, 3) map points that each frame saw, moved in the same way. A pose keeps its place
+    # relative to them, because they are metres away and may be far older.
     anchors: list[Float64] = field(default_factory=list)
-    anchor_times: list[Float64] = field(default_factory=list)  # (ANCHORS,) when those were created
-    # relative constraints of the loops closed.
+    anchor_times: list[Float64] = field(default_factory=list)  # (ANCHORS,) their creation times
+    # relative constraints of the closed loops.
     joined: Constraints = field(default_factory=no_constraints)
-    # the frame at which a loop was found that waits to be confirmed, None: there is none.
+    # frame of a loop that waits for confirmation; None without one.
     found: int | None = None
-    # (4, 4) of the world about the camera, which would have closed it.
+    # (4, 4) motion of the world around the camera that would have closed that loop.
     correction: Float64 = field(default_factory=lambda: np.eye(4))
 
     saved = ("frames", "poses", "anchors", "anchor_times", "found", "correction")
@@ -49,7 +49,7 @@ class TrajectoryHistory(Saved):
         return self.frames[-1] if self.frames else -1
 
     def record(self, surfel_map: SurfelMap, env: int, frame: int, pose: Float64) -> None:
-        """Take note of a frame that was just fused."""
+        """Record a frame that was just fused."""
         points, times = _seen_now(surfel_map, env, frame)
         self.frames.append(frame)
         self.poses.append(pose.copy())
@@ -57,17 +57,17 @@ class TrajectoryHistory(Saved):
         self.anchor_times.append(times)
 
     def loop_at(self, pose: Float64, before: int) -> Loop:
-        """What a camera found at ``pose`` (4, 4) says: the frame ``before`` one that is nearest."""
+        """The loop from a camera at ``pose`` (4, 4) to the nearest frame ``before`` another."""
         count = max(1, int(np.searchsorted(self.frames, before)))
         motions = invert(np.stack(self.poses[:count])) @ pose
         nearest = int(np.argmin([motion_size(T) for T in motions]))
         return Loop(self.frames[nearest], motions[nearest])
 
     def confirms(self, pose: Float64, corrected: Float64, agreement_m: float, memory: int) -> bool:
-        """Whether the last loop found within ``memory`` frames asks for the same correction.
+        """Whether the last loop found within ``memory`` frames had the same correction.
 
-        An alignment that slides along a surface comes out differently from frame to frame. If
-        not, this one waits to be confirmed.
+        An alignment that slides along a surface differs from frame to frame. If the corrections
+        differ, this one waits to be confirmed.
         """
         is_recent = self.found is not None and self.last - self.found <= memory
         difference = motion_size(invert(self.correction @ pose) @ corrected)
@@ -78,7 +78,7 @@ class TrajectoryHistory(Saved):
         return False
 
     def move(self, deformation: Deformation, joined: Constraints, pose: Float64) -> None:
-        """Follow the map; the last frame's pose is ``pose`` (4, 4)."""
+        """Deform the history with the map; the last frame's pose becomes ``pose`` (4, 4)."""
         points = np.stack(self.anchors)
         times = np.stack(self.anchor_times)
         moved = deformation.points(points.reshape(-1, 3), times.ravel()).reshape(points.shape)
@@ -89,7 +89,7 @@ class TrajectoryHistory(Saved):
         self.joined = join([self.joined.moved_by(deformation), joined]).chosen(newest)
 
     def moved(self, T: Float64) -> TrajectoryHistory:
-        """The same with the world moved by ``T`` (4, 4)."""
+        """A copy with the world moved by ``T`` (4, 4)."""
         joined = self.joined
         sources, targets = (transform_points(T, p) for p in (joined.sources, joined.targets))
         return replace(
@@ -101,7 +101,7 @@ class TrajectoryHistory(Saved):
         )
 
     def merged(self, other: TrajectoryHistory) -> TrajectoryHistory:
-        """This and another of the same world, in the order of time."""
+        """This history merged with another of the same world, in temporal order."""
         order = np.argsort(self.frames + other.frames, kind="stable").tolist()
         both = TrajectoryHistory()
         for name in ("frames", "poses", "anchors", "anchor_times"):
@@ -112,7 +112,7 @@ class TrajectoryHistory(Saved):
         return both
 
     def path_m(self, frame: int) -> float:
-        """Length of the way since a frame."""
+        """Length of the path since a frame."""
         first = int(np.searchsorted(self.frames, frame))
         positions = np.array([pose[:3, 3] for pose in self.poses[first:]]).reshape(-1, 3)
         return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
@@ -122,7 +122,7 @@ class TrajectoryHistory(Saved):
         return np.array(self.frames, dtype=np.int32), np.array(self.poses).reshape(-1, 4, 4)
 
     def get_state(self) -> dict[str, Any]:
-        """Everything, as NumPy arrays."""
+        """The whole state, as NumPy arrays."""
         joined = {name: getattr(self.joined, name).copy() for name in _CONSTRAINT_ARRAYS}
         return super().get_state() | {"joined": joined}
 
@@ -142,19 +142,19 @@ class TrajectoryHistory(Saved):
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on from a state."""
+        """Restore a state of ``get_state``."""
         super().set_state(state)
         arrays = {name: state["joined"][name].copy() for name in _CONSTRAINT_ARRAYS}
         self.joined = Constraints(**arrays)
 
 
 def motion_size(T: Float64) -> float:
-    """How far a motion (4, 4) moves points about 1 m away, at most: metres."""
+    """Upper bound, metres, on how far a motion (4, 4) moves points about 1 m away."""
     return float(np.linalg.norm(T[:3, 3]) + relative_angle(np.eye(3), T[:3, :3]))
 
 
 def _seen_now(surfel_map: SurfelMap, env: int, frame: int) -> tuple[Float64, Float64]:
-    """Some of the surfels (ANCHORS, 3) that a frame updated or started, and their times."""
+    """Positions (ANCHORS, 3) of surfels that a frame updated or started, and their times."""
     surfels = surfel_map.surfels
     used = int(surfels.count.numpy()[env])
     slots = np.flatnonzero(surfels.seen[env, :used].numpy() == frame) if used else np.zeros(0, int)
@@ -166,7 +166,7 @@ def _seen_now(surfel_map: SurfelMap, env: int, frame: int) -> tuple[Float64, Flo
 
 
 def _rigid_motions(before: Float64, after: Float64) -> Float64:
-    """Motions (N, 4, 4) that take points (N, K, 3) closest to others (Kabsch 1976)."""
+    """Motions (N, 4, 4) that best map points ``before`` (N, K, 3) to ``after`` (Kabsch 1976)."""
     centre_before, centre_after = before.mean(axis=1), after.mean(axis=1)
     spread = np.swapaxes(after - centre_after[:, None], 1, 2) @ (before - centre_before[:, None])
     U, _, Vt = np.linalg.svd(spread)
@@ -178,20 +178,20 @@ def _rigid_motions(before: Float64, after: Float64) -> Float64:
     return motions
 
 
-_LEAST_COSINE = 0.7  # of the normals of two surfels of one surface
-_SAME_M = 0.02  # farthest apart that they lie along the normal
+_LEAST_COSINE = 0.7  # of the angle between the normals of two surfels of one surface
+_SAME_M = 0.02  # largest distance between them along the normal
 
 
 @dataclass
 class DetachedMap(Saved):
-    """What has been mapped: surfels, keyframes, history.
+    """A map without its SLAM: surfels, keyframes and history.
 
     Attributes:
-        surfels: arrays (M, ...) by name, as ``SurfelMap.get_surfels`` gives them.
-        keyframes: as ``Relocalization.get_keyframes`` gives them.
-        history: of the frames; empty where no loops are closed.
-        label: number of the submap.
-        since: frame at which it was put aside.
+        surfels: arrays (M, ...) by name, from ``SurfelMap.get_surfels``.
+        keyframes: arrays by name, from ``Relocalization.get_keyframes``.
+        history: of the frames; empty without loop closure.
+        label: index of the submap.
+        since: frame at which it was set aside.
     """
 
     surfels: dict[str, NDArray[Any]] = field(default_factory=dict)
@@ -208,7 +208,7 @@ class DetachedMap(Saved):
         return self.surfels["confidence"] > 0
 
     def moved(self, T: Float64) -> DetachedMap:
-        """The same with the world moved by ``T`` (4, 4)."""
+        """A copy with the world moved by ``T`` (4, 4)."""
         surfels, keyframes = dict(self.surfels), dict(self.keyframes)
         position = surfels["position"].astype(np.float64)
         surfels["position"] = transform_points(T, position).astype(np.float32)
@@ -218,16 +218,16 @@ class DetachedMap(Saved):
         return replace(self, surfels=surfels, keyframes=keyframes, history=self.history.moved(T))
 
     def resumed(self, frame: int) -> DetachedMap:
-        """The same as if no time had gone by from when it was put aside until ``frame``."""
+        """A copy as if no time had passed between setting it aside and ``frame``."""
         surfels = dict(self.surfels)
         surfels["seen"] = surfels["seen"] + np.int32(frame - self.since)
         return replace(self, surfels=surfels, since=frame)
 
     def merged(self, newer: DetachedMap, stable: float) -> DetachedMap:
-        """This map and a newer one of the same world as one.
+        """This map merged with a newer one of the same world.
 
-        Where both have the same surface, surfels of the newer one that are not ``stable`` (their
-        confidence is less) are left out.
+        Where both have the same surface, surfels of the newer one with a confidence below
+        ``stable`` are dropped.
         """
         kept = newer.living & ~(self._has(newer) & (newer.surfels["confidence"] < stable))
         return replace(

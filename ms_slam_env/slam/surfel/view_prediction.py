@@ -1,10 +1,10 @@
 # ruff: noqa: UP018, RUF046
-"""Predicts the images of many camera poses from the map.
+"""Predict the images of many camera poses from the map.
 
-The points of a layered depth image are warped into many cameras. The front surface and the surface
-behind it, rendered from one reference pose with a wider field of view (a layered depth image: Shade
-et al., SIGGRAPH 1998), hold about one point per pixel of the predicted images, already averaged
-over the surfels. Warping these costs a tenth of splatting the surfels into every view.
+The front surface and the surface behind it are rendered from one reference pose with a wider field
+of view (a layered depth image: Shade et al., SIGGRAPH 1998), and their points are warped into all
+cameras. They are about one point per pixel of the predicted images, already averaged over the
+surfels. Warping them costs a tenth of splatting the surfels into every view.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from ms_slam_env.slam.surfel.surfels import (
 EMPTY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
 DEPTH_BINS_PER_M = wp.constant(10.0)  # points in one depth bin compete by distance to the pixel
 HIDDEN = wp.constant(wp.int64(1 << 39))  # key bit of points of the second layer
-CLOSE_GAP = wp.constant(4)  # an empty pixel with at least so many neighbours is a gap to close
+CLOSE_GAP = wp.constant(4)  # an empty pixel with at least this many neighbours is a gap to close
 
 
 @wp.struct
@@ -81,10 +81,10 @@ def scatter_points(
     workers: int,
     keys: wp.array[wp.int64],
 ) -> None:
-    """Z-buffer of the points: per pixel the smallest key of the points within a pixel of it.
+    """Fill a z-buffer: for each pixel, the smallest key of the points within a pixel of it.
 
-    A key is (depth bin, layer, squared distance to the pixel, point), so among the points of one
-    surface the one nearest to the pixel wins, and what the reference view hides stays hidden.
+    A key is (depth bin, layer, squared distance to the pixel, point). So among the points of one
+    surface the nearest to the pixel wins, and points hidden in the reference view stay hidden.
     ``motions[v]`` is T_view_reference; keys are (V * h * w).
     """
     view, worker = wp.tid()
@@ -142,7 +142,7 @@ def scatter_points(
 def gap_key(
     keys: wp.array[wp.int64], image: int, v: int, u: int, height: int, width: int
 ) -> wp.int64:
-    """Key of the farthest neighbour of an empty pixel that enough neighbours surround."""
+    """Key of the farthest neighbour of an empty pixel with enough neighbours."""
     found = int(0)
     farthest = wp.int64(-1)
     for y in range(wp.max(v - 1, 0), wp.min(v + 2, height)):
@@ -168,7 +168,7 @@ def resolve_views(
     depth: wp.array[wp.float32],
     normals: wp.array[wp.vec3],
 ) -> None:
-    """Images of the winning points; small gaps take the farthest neighbour, the rest is 0.
+    """Write images of the winning points; small gaps take the farthest neighbour, others are 0.
 
     The depth at a pixel is that of the winner's plane, within a tenth of the winner's own depth.
     """
@@ -180,7 +180,7 @@ def resolve_views(
     width = camera.width
     image = view * height * width
     row = image + v * width
-    # Planes are met in the reference frame, where the points are: n . (p + shift) = z n . ray.
+    # Intersect planes in the reference frame, where the points are: n . (p + shift) = z n . ray.
     R_back = wp.transpose(R)
     shift = R_back * t
     across = wp.vec3(R_back[0, 0], R_back[1, 0], R_back[2, 0]) / camera.focal[0]
@@ -228,10 +228,10 @@ def copy_view(
     normals[view, v, u] = normals_of_view[e, v, u]
 
 
-MAX_MARGIN = 1.0  # a reference view wider than the views by more than their own size is refused
+MAX_MARGIN = 1.0  # largest margin of the reference view on each side, in sizes of the views
 NEAREST_M = 0.5  # surfaces closer than this may leave the reference view's margin
-LAYERS = 8.0  # surfaces of discs that are drawn in a view of its own
-SIZE_STEP_PX = 8  # reference views come in such steps, so that few sets of buffers are needed
+LAYERS = 8.0  # surfaces of discs drawn in a view that is rendered on its own
+SIZE_STEP_PX = 8  # margins are multiples of this, so that few sets of buffers are needed
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ class DeviceViews:
 
 
 def mean_pose(poses: Float64) -> Float64:
-    """Pose (4, 4) in the middle of poses (N, 4, 4): mean position, chordal mean of rotations."""
+    """Mean (4, 4) of poses (N, 4, 4): mean position, chordal mean of rotations."""
     U, _, Vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
     result = np.eye(4)
     result[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
@@ -254,9 +254,9 @@ def mean_pose(poses: Float64) -> Float64:
 
 
 def wide_intrinsics(intrinsics: Intrinsics, motions: Float64) -> Intrinsics | None:
-    """Intrinsics of a reference view that sees what views at T_reference_view (V, 4, 4) see.
+    """Intrinsics of a reference view that covers the views at T_reference_view (V, 4, 4).
 
-    None if no image of at most (1 + 2 MAX_MARGIN) times the size does: the views are too far apart.
+    None if this takes more than (1 + 2 MAX_MARGIN) times the size: the views are too far apart.
     """
     w, h = intrinsics.width, intrinsics.height
     rays = intrinsics.rays_at([[u, v] for v in (-0.5, h - 0.5) for u in (-0.5, w - 0.5)])
@@ -301,7 +301,7 @@ class _Reference:
 
 
 class ViewPredictor:
-    """Predicts views near each other by warping one reference view; far ones one by one."""
+    """Predicts nearby views by warping one reference view, and distant ones one by one."""
 
     def __init__(
         self, buffers: MapBuffers, intrinsics: Intrinsics, parameters: SplatParameters
@@ -316,7 +316,7 @@ class ViewPredictor:
         self._outputs: dict[tuple[int, Intrinsics], tuple[wp.array, DeviceViews]] = {}
 
     def predict(self, poses: Float64, scale: float, first_env: int) -> DeviceViews:
-        """Images (E * N, h, w) from ``poses`` (E, N, 4, 4) of the envs from ``first_env`` on."""
+        """Images (E * N, h, w) from ``poses`` (E, N, 4, 4) of E envs, the first ``first_env``."""
         if poses.ndim != 4 or poses.shape[2:] != (4, 4) or 0 in poses.shape:
             raise InputError(f"poses must be (envs, views, 4, 4), got {poses.shape}")
         if not np.isfinite(poses).all():
@@ -355,8 +355,8 @@ class ViewPredictor:
     def _predict_singly(self, poses: Float64, views: DeviceViews, first_env: int) -> None:
         """Splat the surfels themselves into every view, one view per env at a time.
 
-        Seen from far away, or in small images, there are dozens to a pixel: so many are left out
-        that some are left.
+        From far away, or in small images, there are dozens of surfels per pixel, so they are
+        thinned.
         """
         envs, count = poses.shape[:2]
         key = (envs, views.intrinsics)
@@ -372,7 +372,7 @@ class ViewPredictor:
             wp.launch(copy_view, dim, inputs, device=self.device)
 
     def _upload(self, poses: Float64) -> wp.array:
-        """(..., 4, 4) float64 as a flat device array of mat44."""
+        """Upload poses (..., 4, 4) float64 as a flat device array of mat44."""
         flat = np.ascontiguousarray(poses.reshape(-1, 4, 4), dtype=np.float32)
         return wp.array(flat, dtype=wp.mat44, device=self.device)
 
