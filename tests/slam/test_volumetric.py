@@ -142,6 +142,8 @@ def test_the_peer_aligns_by_geometry_alone_and_checks_nothing(box_scene):
     for name in ("volumetric", "open3d"):
         backend = slam.make(name, camera)
         backend.reset(start)
+        black = np.zeros((*camera.shape, 3), dtype=np.uint8), np.zeros(camera.shape, np.float32)
+        assert not backend.track(RGBDFrame(*black)).tracking_ok
         backend.track(sensor.capture(start, 0))
         results[name] = backend.track(negative)
     assert not results["volumetric"].tracking_ok

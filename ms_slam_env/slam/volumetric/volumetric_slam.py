@@ -19,7 +19,11 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.odometry.odometry import Aligner
-from ms_slam_env.slam.shared.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
+from ms_slam_env.slam.shared.alignment_check import (
+    FEWEST_READINGS,
+    NO_ALIGNMENT,
+    AcceptanceThresholds,
+)
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, check_alignment
 from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam, motion_hypotheses
 from ms_slam_env.slam.slam_backend import Views, check_views
@@ -261,6 +265,8 @@ class Open3DSlam(VolumetricSlam):
     def __init__(self, intrinsics: Intrinsics, config: Open3DConfig | None = None) -> None:
         """Start empty at the identity pose."""
         super().__init__(intrinsics, config or Open3DConfig())
+        if not self.config.stock:
+            self.fewest_readings = FEWEST_READINGS
 
     @property
     def _accepts_all(self) -> bool:
