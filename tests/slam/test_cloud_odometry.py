@@ -77,6 +77,12 @@ def test_kiss_icp_is_what_the_library_does(frames: list[RGBDFrame]) -> None:
     np.testing.assert_allclose(found, np.stack(expected), atol=1e-6)
 
 
+def test_rounding_does_not_grow(frames: list[RGBDFrame]) -> None:
+    backend = _make("small_gicp", downsampling_m=0.1)
+    R = _track(backend, [frames[0]] * 60)[-1][:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
 def test_small_gicp_undoes_a_known_motion(frames: list[RGBDFrame]) -> None:
     """The same readings at another pose: what is found must be that pose."""
     backend = _make("small_gicp")

@@ -20,7 +20,7 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import invert
+from ms_slam_env.geometry import invert, orthonormal
 from ms_slam_env.slam.shared.alignment_check import NO_ALIGNMENT
 from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam
 from ms_slam_env.slam.slam_backend import LARGEST_CUTOFF_M, BorrowedMap
@@ -124,7 +124,8 @@ class CloudOdometry(BorrowedMap, FrameByFrameSlam[Cloud, None]):
         return Cloud(points, float(is_read.mean()))
 
     def _attempts(self, prepared: Cloud, guess: Float64 | None) -> Iterator[Attempt[None]]:
-        start = self._pose @ self._motion if guess is None else guess
+        # Made rigid, or rounding errors of the rotation grow from frame to frame.
+        start = self._pose @ orthonormal(self._motion) if guess is None else guess
         pose = self._register(prepared, start)
         if np.isfinite(pose).all():
             yield Attempt(pose, NO_ALIGNMENT, "", None)
@@ -183,7 +184,7 @@ class SmallGicpSlam(CloudOdometry):
             rotation_epsilon=_STEP,
             translation_epsilon=_STEP,
         )
-        return np.array(found.T_target_source)
+        return orthonormal(np.array(found.T_target_source))
 
     def _insert(self, cloud: Cloud) -> None:
         source = self._source if cloud is self._cloud else self._thinned(cloud)
