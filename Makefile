@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 WORKERS ?= 2
 BIN := .venv/bin
 STAMP := .venv/.installed
-EXTRAS := open3d,gtsam,ros,train,rllib,explore,ray,report,record,view,energy,video,docs,dev
+EXTRAS := open3d,peers,gtsam,ros,train,rllib,explore,ray,report,record,view,energy,video,docs,dev
 SYSTEM_LIBRARIES := libusb-1.0-0 libgl1
 # One thread per process: the tests and the benchmark run in parallel processes.
 export OMP_NUM_THREADS := 1

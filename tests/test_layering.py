@@ -29,6 +29,7 @@ NEVER = {
     *("ms_slam_baselines", "ms_slam_agents", "ms_slam_experiments"),
 }
 ONLY_INSIDE_FUNCTIONS = {
+    "kiss_icp",
     "open3d",
     "optuna",
     "pynvml",

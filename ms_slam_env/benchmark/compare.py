@@ -59,8 +59,8 @@ DEFAULT_SEQUENCES = (
 
 _TIME = "cpu_ms_mean"  # the only processor time that is also known for a command
 
-PEERS = ("odometry,stock=true", "volumetric,stock=true")
-"""OpenCV's odometry and Open3D's dense SLAM, unmodified."""
+PEERS = ("odometry,stock=true", "volumetric,stock=true", *slam.PEERS)
+"""OpenCV's odometry and Open3D's dense SLAM, unmodified; other libraries at their best."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,8 @@ class Compare(Experiment, Checked):
     """Folders, or scene:seed[:word[+word ...]]."""
     backends: tuple[str, ...] = (*slam.BACKENDS, *PEERS)
     """NAME, parameters appended as in surfel,loop_closure=deformation; odometry,stock=true is
-    OpenCV's unmodified odometry, volumetric,stock=true Open3D's dense SLAM. Any other system is
+    OpenCV's unmodified odometry, volumetric,stock=true Open3D's dense SLAM. open3d, small_gicp and
+    kiss_icp are other libraries with their best parameters. Any other system is
     "NAME=command:PROGRAM --in {sequence} --out {trajectory}", where NAME is for the tables: it
     reads a folder in the TUM layout and writes a TUM trajectory."""
     image_sizes: tuple[str, ...] = ("160x120", "320x240")

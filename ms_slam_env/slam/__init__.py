@@ -8,12 +8,13 @@ from ms_slam_env.slam.configuration import (
     read_configuration,
     write_configuration,
 )
-from ms_slam_env.slam.registry import BACKENDS, POINT, check_parameters
+from ms_slam_env.slam.registry import BACKENDS, PEERS, POINT, check_parameters
 from ms_slam_env.slam.shared.state import Saved
 from ms_slam_env.slam.slam_backend import BorrowedMap, SlamBackend, TrackResult, Views
 
 __all__ = [
     "BACKENDS",
+    "PEERS",
     "POINT",
     "BorrowedMap",
     "Saved",

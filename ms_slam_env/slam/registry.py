@@ -39,14 +39,23 @@ _OWN = {
     "sparse": BackendEntry("sparse", "SparseSlam", "SparseConfig"),
 }
 
+_PEERS = {
+    "open3d": BackendEntry("volumetric", "Open3DSlam", "Open3DConfig"),
+    "small_gicp": BackendEntry("odometry.cloud_odometry", "SmallGicpSlam", "SmallGicpConfig"),
+    "kiss_icp": BackendEntry("odometry.cloud_odometry", "KissIcpSlam", "KissIcpConfig"),
+}
+
 BACKENDS: tuple[str, ...] = tuple(_OWN)
-"""Names of the built-in backends."""
+"""Names of the built-in backends that can do all that ``SlamBackend`` describes."""
+
+PEERS: tuple[str, ...] = tuple(_PEERS)
+"""Names of other libraries' systems, to compare with; their runs may not repeat bit-exactly."""
 
 POINT = ExtensionPoint(
     "SLAM backend",
     "ms_slam_env.slam",
     SlamBackend,
-    own=_OWN,
+    own=_OWN | _PEERS,
     elsewhere={
         "([^=,:]+=)?command:": "an external program is run by ms-slam compare alone, as in "
         "ms-slam compare --backends 'NAME=command:PROGRAM --in {sequence} --out {trajectory}'"

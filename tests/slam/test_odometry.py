@@ -51,6 +51,31 @@ def test_a_clean_sequence_is_tracked(name: str, limit_m: float, sequence: Sequen
     assert len(backend.surface_points()) > 1000
 
 
+def test_stock_is_what_open3d_does(sequence: Sequence) -> None:
+    """Its ``t.pipelines.slam.Model``, driven as in its example ``dense_slam.py``."""
+    backend = _make("volumetric", sequence)
+    backend.reset()  # the voxels lie as in its model
+    found = [backend.track(frame).T_world_camera for frame in sequence.frames]
+    import open3d as o3d
+
+    device, scale, cutoff_m = o3d.core.Device("CPU:0"), 5000.0, 4.0
+    pose = o3d.core.Tensor(np.eye(4))
+    model = o3d.t.pipelines.slam.Model(0.01, 16, 40_000, pose, device)
+    K = o3d.core.Tensor(CAMERA.matrix)
+    live, view = (o3d.t.pipelines.slam.Frame(*CAMERA.shape, K, device) for _ in range(2))
+    for index, frame in enumerate(sequence.frames):
+        depth = np.rint(frame.depth * scale).astype(np.uint16)[..., None]
+        for name, image in (("depth", depth), ("color", np.ascontiguousarray(frame.color))):
+            live.set_data_from_image(name, o3d.t.geometry.Image(o3d.core.Tensor(image)))
+        if index:
+            result = model.track_frame_to_model(live, view, scale, cutoff_m, 0.07)
+            pose = pose @ result.transformation
+        model.update_frame_pose(index, pose)
+        model.integrate(live, scale, cutoff_m, 8.0)
+        model.synthesize_model_frame(view, scale, 0.1, cutoff_m, 8.0, False)
+        np.testing.assert_allclose(found[index], pose.numpy(), atol=5e-3)
+
+
 def test_any_motion_that_is_found_is_believed(sequence: Sequence) -> None:
     """A frame upside down in brightness fits nothing, and only the checks can tell."""
     frame = sequence.frames[1]

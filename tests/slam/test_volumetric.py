@@ -11,7 +11,7 @@ from surfel_scenes import WALL_NORMAL, WALL_POINT, ray_cast
 from ms_slam_env import slam
 from ms_slam_env.camera import Intrinsics, RGBDFrame, xtion
 from ms_slam_env.errors import InputError
-from ms_slam_env.geometry import make_pose, so3_exp
+from ms_slam_env.geometry import look_at, make_pose, so3_exp
 
 # No multiple of 8: Open3D's default bounds of rays would be read out of range.
 CAMERA = Intrinsics(fx=150.0, fy=155.0, cx=74.3, cy=56.8, width=150, height=114)
@@ -126,3 +126,32 @@ def test_without_open3d_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(InputError, match=r"ms-slam-env\[open3d\].*libgl1"):
         slam.make("volumetric", xtion("80x60"))
+
+
+def test_the_peer_aligns_by_geometry_alone_and_checks_nothing(box_scene):
+    """An image with negated brightness has the same depth."""
+    from ms_slam_env.sensor import RGBDSensor
+
+    camera = xtion("160x120")
+    sensor = RGBDSensor(box_scene, camera, noise="none", seed=0)
+    start = look_at([-0.8, -0.8, 1.2], [1.0, 0.0, 0.6])
+    moved = start @ make_pose(so3_exp([0.0, 0.01, 0.0]), [0.01, -0.005, 0.01])
+    frame = sensor.capture(moved, 1)
+    negative = RGBDFrame(255 - frame.color, frame.depth)
+    results = {}
+    for name in ("volumetric", "open3d"):
+        backend = slam.make(name, camera)
+        backend.reset(start)
+        black = np.zeros((*camera.shape, 3), dtype=np.uint8), np.zeros(camera.shape, np.float32)
+        assert not backend.track(RGBDFrame(*black)).tracking_ok
+        backend.track(sensor.capture(start, 0))
+        results[name] = backend.track(negative)
+    assert not results["volumetric"].tracking_ok
+    assert results["open3d"].tracking_ok
+    error = results["open3d"].T_world_camera[:3, 3] - moved[:3, 3]
+    assert np.linalg.norm(error) < 0.004
+
+
+def test_truncation_may_be_a_whole_number():
+    one, other = (_mapped(1, truncation_voxels=value).predict(POSE[None]) for value in (8, 8.0))
+    np.testing.assert_array_equal(one.depth, other.depth)

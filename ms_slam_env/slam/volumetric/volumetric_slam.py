@@ -19,13 +19,18 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.camera import Intrinsics, RGBDFrame, intensity_image
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.odometry.odometry import Aligner
-from ms_slam_env.slam.shared.alignment_check import NO_ALIGNMENT, AcceptanceThresholds
+from ms_slam_env.slam.shared.alignment_check import (
+    FEWEST_READINGS,
+    NO_ALIGNMENT,
+    AcceptanceThresholds,
+)
 from ms_slam_env.slam.shared.alignment_measures import DepthImage, check_alignment
 from ms_slam_env.slam.shared.tracking_template import Attempt, FrameByFrameSlam, motion_hypotheses
 from ms_slam_env.slam.slam_backend import Views, check_views
 from ms_slam_env.slam.volumetric.voxel_grid import (
     DEPTH_SCALE,
     CastView,
+    Open3DConfig,
     StockVoxelGrid,
     VolumetricConfig,
     VoxelGrid,
@@ -46,9 +51,9 @@ class FrameToModel(ABC):
 
 
 class Open3DAlignment(FrameToModel):
-    """Open3D's hybrid odometry, as in its dense SLAM: point-to-plane plus photometric.
+    """Open3D's odometry: point-to-plane, as in its dense SLAM, or point-to-plane plus photometric.
 
-    Its sums over pixels are rounded differently in every run, even on one thread.
+    On several cores its sums over pixels are rounded differently in every run.
     """
 
     def __init__(self, grid: VoxelGrid) -> None:
@@ -59,6 +64,8 @@ class Open3DAlignment(FrameToModel):
         self._criteria = [self._odometry.OdometryConvergenceCriteria(count) for count in counts]
         self._loss = self._odometry.OdometryLossParams(_ASSOCIATION_M)
         self._start = grid.tensor(np.eye(4))
+        methods = self._odometry.Method
+        self._method = methods.Hybrid if grid.config.aligner == "open3d" else methods.PointToPlane
 
     def align(self, frame: DepthImage, view: CastView) -> Float64 | None:
         """Align a frame with a view of the model; return T_model_camera (4, 4) or None."""
@@ -75,7 +82,7 @@ class Open3DAlignment(FrameToModel):
                 1.0,
                 grid.config.depth_cutoff_m,
                 self._criteria,
-                self._odometry.Method.Hybrid,
+                self._method,
                 self._loss,
             )
         except RuntimeError:  # a singular system
@@ -97,6 +104,7 @@ class OpenCVAlignment(FrameToModel):
 
 
 _FULL_WEIGHT = 3  # observations that tracking requires once that many frames are fused
+_STOCK_FULL_WEIGHT = 4  # Open3D requires more than 3
 
 
 @dataclass(frozen=True)
@@ -118,7 +126,7 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
         self.config = config or VolumetricConfig()
         in_force = self.config.in_force
         grid = (StockVoxelGrid if in_force.stock else VoxelGrid)(intrinsics, in_force)
-        is_open3d = in_force.aligner == "open3d"
+        is_open3d = in_force.aligner != "opencv"
         cutoff_m = in_force.depth_cutoff_m
         self._assemble(
             grid, Open3DAlignment(grid) if is_open3d else OpenCVAlignment(intrinsics, cutoff_m)
@@ -127,9 +135,14 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
     def _assemble(self, grid: VoxelGrid, aligner: FrameToModel) -> None:
         """Start empty at the identity pose, with these parts and the settings of ``config``."""
         self._grid, self._aligner = grid, aligner
-        self._judge_views(self.config.stock)
+        self._judge_views(self._accepts_all)
         self._fresh = True  # whether the grid is as allocated
         super().__init__(grid.intrinsics)
+
+    @property
+    def _accepts_all(self) -> bool:
+        """Whether every motion that is found is accepted, and no other pose is tried."""
+        return bool(self.config.stock)
 
     @property
     def _has_map(self) -> bool:
@@ -157,7 +170,7 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
         if self._view is None:
             self._view = self._cast(self._pose)
         yield self._align(prepared, self._pose, self._view, self._thresholds)
-        if self.config.stock:
+        if self._accepts_all:
             return
         if guess is not None:
             yield self._confirmed(prepared, guess)
@@ -190,7 +203,7 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
 
     def _cast(self, pose: Float64) -> CastView:
         """The view that frames are aligned with, cast from ``pose``."""
-        weight = min(self._fused, _FULL_WEIGHT)
+        weight = min(self._fused, _STOCK_FULL_WEIGHT if self.config.stock else _FULL_WEIGHT)
         return self._grid.cast(pose, weight, self.intrinsics)
 
     def _start_from(self, frame: RGBDFrame, prepared: FusedImage) -> None:
@@ -244,3 +257,17 @@ class VolumetricSlam(FrameByFrameSlam[FusedImage, None]):
         super().set_state(state)
         self._fresh = False
         self._view = None
+
+
+class Open3DSlam(VolumetricSlam):
+    """Open3D's dense SLAM with its best parameters; accepts every motion that Open3D returns."""
+
+    def __init__(self, intrinsics: Intrinsics, config: Open3DConfig | None = None) -> None:
+        """Start empty at the identity pose."""
+        super().__init__(intrinsics, config or Open3DConfig())
+        if not self.config.stock:
+            self.fewest_readings = FEWEST_READINGS
+
+    @property
+    def _accepts_all(self) -> bool:
+        return True
