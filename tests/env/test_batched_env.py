@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +13,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import ms_slam_env  # noqa: F401 -- registers the environments
+from ms_slam_env._runtime.warp import wp
 from ms_slam_env.env.batched.batched_env import BatchedActiveSlam
 from ms_slam_env.errors import InputError
 
@@ -149,6 +152,15 @@ def test_a_reset_in_the_same_step_gives_the_start_that_the_next_step_would() -> 
     assert one[1][0] == other[1][0]
 
 
+def test_starts_come_from_a_pool_if_asked_for() -> None:
+    env = batch_of(FREE, 6, start_pool=2, **{**SMALL, "scene": "table"})
+    poses = [env.reset(seed=seed)[1]["T_world_camera"] for seed in (0, 0, 100)]
+    np.testing.assert_array_equal(poses[0], poses[1])
+    assert len(np.unique(np.concatenate(poses).reshape(-1, 16), axis=0)) == 2
+    with pytest.raises(InputError, match="start_pool"):
+        batch_of(FREE, 1, start_pool=-1)
+
+
 def test_masks_are_had_as_sb3_contrib_asks_for_them() -> None:
     env = batch_of(FREE, 2, step_m=1.0, **TWO)
     _, info = env.reset(seed=1)
@@ -158,7 +170,7 @@ def test_masks_are_had_as_sb3_contrib_asks_for_them() -> None:
     np.testing.assert_array_equal(env.call("action_masks"), masks)
     assert not np.all(masks)
     with pytest.raises(InputError, match="only action_masks"):
-        env.call("lookahead")
+        env.call("reset")
 
 
 def test_an_episode_must_be_reset_by_hand_if_nothing_else_does() -> None:
@@ -208,3 +220,12 @@ def test_bad_actions_and_resets_are_refused() -> None:
         env.reset(options={"T_world_camera": outside})
     with pytest.raises(InputError, match="must be reset"):
         env.step([0, 0])
+
+
+@pytest.mark.parametrize("name", ["env.batched.kernels", "sensor.camera_batch"])
+def test_kernels_compile_for_a_gpu(name: str, tmp_path: Path) -> None:
+    """As `test_cuda_code` has it of SLAM's; nothing here needs a GPU."""
+    module = import_module(f"ms_slam_env.{name}")
+    wp.compile_aot_module(module, arch=90, module_dir=str(tmp_path), use_ptx=True)
+    [file] = tmp_path.glob("*.ptx")
+    assert file.read_text().count(".entry") == 4

@@ -10,7 +10,7 @@ from ms_slam_env.env.make import options_for
 from ms_slam_env.errors import InputError
 from ms_slam_env.tasks import find_task
 
-_OWN = ("task", "max_episode_steps", "device", "autoreset_mode")
+_OWN = ("task", "max_episode_steps", "device", "autoreset_mode", "start_pool")
 
 
 def make_batched(
@@ -18,6 +18,7 @@ def make_batched(
     task: Any = None,
     device: str = "cpu",
     autoreset_mode: Any = "NextStep",
+    start_pool: int = 0,
     max_episode_steps: int | None = None,
     embodiment: str = "free",
     **options: Any,
@@ -36,4 +37,5 @@ def make_batched(
             raise InputError(f"in a batch there are no perturbations, as in task {task!r}")
         options = options_for(found, options)
     config = make_config(options, _OWN)
-    return BatchedActiveSlam(num_envs, config, device, max_episode_steps, autoreset_mode)
+    own = device, max_episode_steps, autoreset_mode, start_pool
+    return BatchedActiveSlam(num_envs, config, *own)
