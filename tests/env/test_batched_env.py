@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-import ms_slam_env  # noqa: F401 -- registers the environments
+import ms_slam_env
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.env.batched.batched_env import BatchedActiveSlam
 from ms_slam_env.errors import InputError
@@ -106,6 +106,7 @@ def run_beside(
 def test_a_batch_does_what_each_environment_does_alone(num_envs: int) -> None:
     """Through ends of episodes, losses, blocked motions, and resets into other scenes."""
     options = {**TWO, "step_m": 0.25, "step_rad": 0.4, "lost_patience": 2, "max_episode_steps": 13}
+    options["episodes_per_scene"] = 2
     seen = run_beside(FREE, num_envs, 30, 0.3, **options)
     assert seen["ended"] >= 2 * num_envs
     if num_envs > 1:
@@ -150,6 +151,18 @@ def test_a_reset_in_the_same_step_gives_the_start_that_the_next_step_would() -> 
     one, other = later.step(np.array([8, 0])), at_once.step(np.array([8, 0]))
     np.testing.assert_array_equal(one[0][0], other[0][0])
     assert one[1][0] == other[1][0]
+
+
+def test_every_id_of_a_batch_is_made_like_the_id_of_one() -> None:
+    assert (f"batched/{FREE}", f"batched/{ROOM}") == ms_slam_env.BATCHED_IDS
+    for env_id in (FREE, ROOM):
+        batch, alone = batch_of(env_id, 1), gym.make(env_id, disable_env_checker=True)
+        assert batch.config == alone.unwrapped.config  # type: ignore[attr-defined]
+        assert batch.spec is not None
+        assert alone.spec is not None
+        assert batch.spec.max_episode_steps == alone.spec.max_episode_steps
+        assert batch.single_observation_space == alone.observation_space
+        assert batch.single_action_space == alone.action_space
 
 
 def test_starts_come_from_a_pool_if_asked_for() -> None:
