@@ -219,6 +219,8 @@ def test_what_a_batch_does_not_have_is_refused(options: dict[str, Any], said: st
 
 def test_bad_actions_and_resets_are_refused() -> None:
     env = batch_of(FREE, 2, **TWO)
+    with pytest.raises(InputError, match="first reset must be of all"):
+        env.reset(options={"reset_mask": np.array([True, False])})
     env.reset(seed=0)
     for actions in ([0], [0, 49], [-1, 0], [0.5, 0], [[0, 0]]):
         with pytest.raises(InputError, match="actions"):

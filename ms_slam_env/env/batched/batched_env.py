@@ -196,6 +196,9 @@ class BatchedActiveSlam(VectorEnv[Float32, Int64, Any]):
         """
         given = dict(options or {})
         where = self._checked_mask(given.pop("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        unseen = [env for env, scene in enumerate(self._worlds.scenes) if scene is None]
+        if not where[unseen].all():
+            raise InputError("reset option reset_mask: the first reset must be of all environments")
         seeds = self._checked_seeds(seed)
         for one in seeds:
             check_reset(one, given, self.config.scenes)
@@ -213,13 +216,13 @@ class BatchedActiveSlam(VectorEnv[Float32, Int64, Any]):
             InputError: actions that are not in the action space, or an environment that was not
                 reset.
         """
-        made_of = self._checked_actions(actions)
+        wanted = self._checked_actions(actions)
         starts = self._ended if self._autoreset is AutoresetMode.NEXT_STEP else self._ended & False
         moves = ~starts
-        made = moves & self._masks[np.arange(self.num_envs), made_of]
-        motions = np.where(made[:, None, None], self._motions[made_of], np.eye(4))
+        made = moves & self._masks[np.arange(self.num_envs), wanted]
+        motions = np.where(made[:, None, None], self._motions[wanted], np.eye(4))
         errors = self._episodes.pose_error.copy()
-        self._episodes.move(moves, made_of, motions)
+        self._episodes.move(moves, wanted, motions)
         self._look(starts, {})
         new_surface = self._track(starts)
         lost_for_good = moves & (self._lost_share() >= 1)
