@@ -8,7 +8,7 @@ python=${PYTHON:-.venv/bin/python}
 device=${DEVICE:-cuda}
 read -ra batches <<<"${BATCHES:-1 16 64 256 1024}"
 export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
-command="import sys; from ms_slam_env.cli import main; sys.exit(main(sys.argv[1:]))"
+command="import sys; sys.argv[0] = 'ms-slam'; from ms_slam_env.cli import main; sys.exit(main(sys.argv[1:]))"
 failed=0
 
 measure() { # SECONDS NAME OPTIONS...: a stage that fails or takes too long does not stop the next
