@@ -66,12 +66,29 @@ TASK_IDS = tuple(_TASKS)
 """The benchmark tasks, each with its scenes, options and episode length."""
 
 
+BATCHED_IDS = tuple(f"batched/{name}" for name in ("MSActiveSLAM-FreeCamera-v0", env_id_of("room")))
+"""Those that ``gym.make_vec`` also steps all at once.
+
+In a namespace of their own: Gymnasium refuses a vector entry point beside the wrapper that follows
+states, and would make it the default of ``make_vec``.
+"""
+
+
 def register_all() -> None:
     """Register the ids with Gymnasium; a second call changes nothing."""
     for env_id, arguments in _ARGUMENTS.items():
         _register(env_id, MAX_EPISODE_STEPS, arguments)
     for env_id, (name, task) in _TASKS.items():
         _register(env_id, task.steps, {**_ARGUMENTS[task.env_id], "task": name})
+    for batched_id in BATCHED_IDS:
+        if batched_id not in gymnasium.registry:
+            single = gymnasium.spec(batched_id.removeprefix("batched/"))
+            gymnasium.register(
+                batched_id,
+                vector_entry_point="ms_slam_env.env.batched.make:make_batched",
+                max_episode_steps=single.max_episode_steps,
+                kwargs=single.kwargs,
+            )
 
 
 def _register(env_id: str, steps: int, arguments: dict[str, Any]) -> None:

@@ -162,6 +162,24 @@ class HostDeviceBuffer:
         return self.look().copy()
 
 
+class StructTable:
+    """Structs of one type on a device, replaced one at a time.
+
+    Attributes:
+        array: the structs, initially zero.
+    """
+
+    def __init__(self, count: int, dtype: Any, device: str) -> None:
+        self.array = wp.zeros(count, dtype=dtype, device=device)
+        self._kept: list[tuple[Any, ...]] = [()] * count
+
+    def put(self, index: int, struct: Any, *kept: Any) -> None:
+        """Replace a struct; its arrays, and what else it refers to (``kept``), stay alive."""
+        one: Any = wp.array([struct], dtype=self.array.dtype, device=self.array.device)
+        wp.copy(self.array, one, dest_offset=index, count=1)
+        self._kept[index] = (struct, *kept)
+
+
 class RecordedLaunch:
     """A repeatable kernel launch whose arguments are packed once.
 
@@ -221,4 +239,4 @@ class RecordedLaunch:
         self._pointers = ctypes.byref(bounds), ctypes.byref(self._packed)
 
 
-__all__ = ["HostDeviceBuffer", "RecordedLaunch", "kernel_wp", "roomy_zeros", "wp"]
+__all__ = ["HostDeviceBuffer", "RecordedLaunch", "StructTable", "kernel_wp", "roomy_zeros", "wp"]

@@ -167,7 +167,7 @@ class _CountingPass:
         height, width = shape = intrinsics.shape
         rows, columns = config.windows if config.measure == "windowed-kl" else (1, 1)
         directions = bin_directions(config.inclinations)
-        self._shape = (batch, height, rows * columns, len(directions))
+        self._shape = (batch, rows * columns, len(directions))
         self._cos_alpha = math.cos(math.radians(config.alpha_deg))
         window_rows = np.arange(height) * rows // height * columns
         windows = (window_rows, np.arange(width) * columns // width)
@@ -202,6 +202,9 @@ class _CountingPass:
             stages.append((kernels.weigh_depth_normals, [inverse, *camera, *weights]))
         dim = (batch, height)
         self._launches = [RecordedLaunch(kernel, dim, inputs, device) for kernel, inputs in stages]
+        self._totals = HostDeviceBuffer((batch, per_row), wp.float64, device)
+        added = [self._sums.array, height, self._totals.array]
+        self._add = RecordedLaunch(kernels.add_rows, (batch, per_row), added, device)
 
     def __call__(self, images: Mapping[str, Any]) -> tuple[Int32, Float64]:
         """Return counts (B, W, 256) of grey levels and sums (B, W, L) of normal weights, (9)."""
@@ -211,11 +214,11 @@ class _CountingPass:
         self._sums.zero()
         for launch in self._launches:
             launch.launch()
-        batch, height, windows, bins = self._shape
-        sums = self._sums.look().reshape(batch, height, -1).sum(axis=1, dtype=np.float64)
+        self._add.launch()
+        batch, windows, bins = self._shape
         return (
             self._levels.look().reshape(batch, windows, 256),
-            (sums / (1 - self._cos_alpha)).reshape(batch, windows, bins),
+            (self._totals.look() / (1 - self._cos_alpha)).reshape(batch, windows, bins),
         )
 
     def _take(self, name: str, image: Any) -> None:

@@ -242,3 +242,20 @@ def compute_normals(
         if v >= radius and v < height - radius and u >= radius and u < width - radius:
             n = normal_at(inverse, b, v, u, radius, edge_threshold, focal, centre)
         normals[b, v, u] = wp.normalize(n)
+
+
+@wp.kernel
+def add_rows(
+    sums: wp.array[wp.float32],  # (B * H * K,)
+    height: int,
+    totals: wp.array2d[wp.float64],  # (B, K)
+) -> None:
+    """Add up the sums of the rows of each frame, from the top, in double precision."""
+    b, k = wp.tid()
+    columns = totals.shape[1]
+    i = b * height * columns + k
+    total = wp.float64(0.0)
+    for _ in range(height):
+        total += wp.float64(sums[i])
+        i += columns
+    totals[b, k] = total

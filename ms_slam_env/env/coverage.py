@@ -18,8 +18,11 @@ from ms_slam_env._runtime.warp import kernel_wp as wp
 from ms_slam_env.native import native_source
 from ms_slam_env.scenes.scene import Scene
 
-_STRIDE = 2  # every second pixel in each direction marks coverage
+STRIDE = 2
+"""Every second pixel in each direction marks coverage."""
 
+VOXEL_M = 0.05
+"""Edge of a voxel."""
 
 _SAMPLES_A_VOXEL = 2  # per edge: four points on each face, so that no voxel is missed
 
@@ -119,12 +122,12 @@ class CoverageGrid:
         voxel_m: edge of a voxel, metres.
     """
 
-    def __init__(self, scene: Scene, rays: Float64, voxel_m: float = 0.05) -> None:
+    def __init__(self, scene: Scene, rays: Float64, voxel_m: float = VOXEL_M) -> None:
         self.voxel_m = voxel_m
         self._voxels = voxels = Voxels.of(scene, voxel_m)
         self._mapped = np.zeros(len(voxels.reachable), dtype=bool)
         self._counts = np.zeros(2, dtype=np.int32)  # mapped voxels, and the reachable among them
-        marked_rays = np.ascontiguousarray(rays[::_STRIDE, ::_STRIDE], dtype=np.float64)
+        marked_rays = np.ascontiguousarray(rays[::STRIDE, ::STRIDE], dtype=np.float64)
         self._depth = np.zeros(marked_rays.shape[:2], dtype=np.float32)
         self._poses = np.zeros((2, 4, 4))
         grid = VoxelGrid()
@@ -154,7 +157,7 @@ class CoverageGrid:
             T_world_camera: (4, 4).
             T_world_camera_estimate: (4, 4).
         """
-        every = slice(None, None, _STRIDE)
+        every = slice(None, None, STRIDE)
         np.multiply(true_depth[every, every], depth[every, every] > 0, out=self._depth)
         self._poses[0], self._poses[1] = T_world_camera, T_world_camera_estimate
         before = int(self._counts[0])

@@ -41,9 +41,17 @@ make_env.metadata = {"render_modes": [*VIEWS]}  # type: ignore[attr-defined]
 
 
 def _make_for(task: Task, perturbed_by: str | None, **options: Any) -> ActiveSlamEnv:
-    """Build the environment of a task; ``options`` override the task's.
+    """Build the environment of a task; see `options_for`."""
+    env = _make(None, perturbed_by, **options_for(task, options))
+    for name, strength in task.perturbations.items():
+        env.perturb(make_perturbation(name, strength))
+    return env
 
-    So do single options of ``slam_config``. The task's are dropped for another SLAM.
+
+def options_for(task: Task, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a task's environment: the task's own, overridden by ``options``.
+
+    Single options of ``slam_config`` are overridden, too. The task's are dropped for another SLAM.
     """
     own: dict[str, Any] = {"scene": task.scenes, **task.options}
     configured, given = own.pop("slam_config", {}), options.get("slam_config", {})
@@ -51,10 +59,7 @@ def _make_for(task: Task, perturbed_by: str | None, **options: Any) -> ActiveSla
     is_surfel = isinstance(slam, str) and parse_named(slam, "backend")[0] == "surfel"
     if is_surfel and is_options(given):
         options = {**options, "slam_config": {**configured, **given}}
-    env = _make(None, perturbed_by, **{**own, **options})
-    for name, strength in task.perturbations.items():
-        env.perturb(make_perturbation(name, strength))
-    return env
+    return {**own, **options}
 
 
 def _make_perturbed(

@@ -45,10 +45,14 @@ CONFIGURATION = "slam_configuration"
 """Key of the SLAM configuration in ``info``, and in an observation of several parts."""
 
 _MAX_DEPTH_M = 20.0
-_DEPTH_SCALE_M = 4.0
-_DEPTH_CAP = _MAX_DEPTH_M / _DEPTH_SCALE_M
-_GREY_BINS = 16
-_ROWS, _COLUMNS = 6, 8
+DEPTH_SCALE_M = 4.0
+"""Unit of depth in vectors."""
+DEPTH_CAP = _MAX_DEPTH_M / DEPTH_SCALE_M
+"""Largest depth in vectors, in that unit."""
+GREY_BINS = 16
+"""Bins of the grey histogram of ``features``."""
+ROWS, COLUMNS = 6, 8
+"""Cells of the coarse depth of ``features``."""
 _BLOCKS = (((10, 6, 10), 0.4), ((8, 4, 8), 1.2))  # around the camera: number, edge in metres
 _GAIN_RAYS = (8, 6)
 _GAIN_CAP_M3 = 20.0  # more than a view of 4 m holds
@@ -91,7 +95,7 @@ class PixelsObservation(Observation):
 
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
         pixels = self.image_shape[1] * self.image_shape[2]
-        highs = [*(1,) * (3 * pixels), *(_DEPTH_CAP,) * pixels]
+        highs = [*(1,) * (3 * pixels), *(DEPTH_CAP,) * pixels]
         self.space = space = _longer(spaces.Box(*STATE_BOUNDS), highs)
         self._bounds = space.low, space.high
 
@@ -100,7 +104,7 @@ class PixelsObservation(Observation):
         depth = np.minimum(knowledge.frame.depth, _MAX_DEPTH_M).astype(np.float32)
         color = self._small(knowledge.frame.color.astype(np.float32)) / 255
         readings = self._small((depth > 0).astype(np.float32))
-        mean_depth = self._small(depth) / np.maximum(readings, 1e-6) / _DEPTH_SCALE_M
+        mean_depth = self._small(depth) / np.maximum(readings, 1e-6) / DEPTH_SCALE_M
         image = np.concatenate([color.transpose(2, 0, 1), mean_depth[None]])
         vector = np.concatenate([state_vector(knowledge), image.ravel()]).astype(np.float32)
         return np.clip(vector, *self._bounds)
@@ -116,14 +120,14 @@ class FeaturesObservation(Observation):
     """State vector (28), grey histogram (16), coarse depth (96), motion mask (n): float32."""
 
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
-        cells = _ROWS * _COLUMNS
-        highs = [*(1,) * _GREY_BINS, *(_DEPTH_CAP,) * cells, *(1,) * (cells + num_motions)]
+        cells = ROWS * COLUMNS
+        highs = [*(1,) * GREY_BINS, *(DEPTH_CAP,) * cells, *(1,) * (cells + num_motions)]
         self.space = _longer(spaces.Box(*STATE_BOUNDS), highs)
 
     def build(self, knowledge: RobotKnowledge) -> Float32:
         """Return the vector."""
         grey = intensity_image(knowledge.frame.color)
-        histogram = np.bincount(grey.ravel() // (256 // _GREY_BINS), minlength=_GREY_BINS)
+        histogram = np.bincount(grey.ravel() // (256 // GREY_BINS), minlength=GREY_BINS)
         return np.concatenate(
             [
                 state_vector(knowledge),
@@ -345,14 +349,14 @@ def coarse_depth(depth: Float32) -> Float32:
     """Mean valid depth / 4 m and share of valid pixels in 6 x 8 cells, (96,) float32."""
     valid = (depth > 0).astype(np.float32)
     total, count, cell = (_cell_sums(image) for image in (depth, valid, np.ones_like(valid)))
-    mean = np.minimum(total / np.maximum(count, 1) / _DEPTH_SCALE_M, _DEPTH_CAP)
+    mean = np.minimum(total / np.maximum(count, 1) / DEPTH_SCALE_M, DEPTH_CAP)
     return np.concatenate([mean.ravel(), (count / cell).ravel()]).astype(np.float32)
 
 
 def _cell_sums(image: Float32) -> Float32:
     """Sums (6, 8) over the cells of an image (H, W)."""
-    rows = np.arange(_ROWS) * image.shape[0] // _ROWS
-    columns = np.arange(_COLUMNS) * image.shape[1] // _COLUMNS
+    rows = np.arange(ROWS) * image.shape[0] // ROWS
+    columns = np.arange(COLUMNS) * image.shape[1] // COLUMNS
     return np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +92,7 @@ class RewardConfig(Checked, Named):
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of one step.
+    """The outcome of one step, or of one step of each of B environments (``weighted_terms``).
 
     Attributes:
         divergence: (2,) intensity and depth divergence between the last two live frames.
@@ -139,20 +140,30 @@ def reward_terms(
                 f"reward {weights!r} returned {value!r}; it must return a number, or a mapping of "
                 "names to numbers"
             ) from None
-    intensity, depth = np.minimum(targets.distances(outcome.divergence), _DISTANCE_CAP)
-    growth = float(np.clip(outcome.pose_error_growth_m, -_ERROR_CAP_M, _ERROR_CAP_M))
-    terms = {
-        "intensity_divergence": -weights.intensity_divergence * float(intensity),
-        "depth_divergence": -weights.depth_divergence * targets.depth_weight * float(depth),
-        "trajectory_error": -weights.trajectory_error * growth,
-        "new_surface": weights.new_surface * outcome.new_surface_m2,
-        "lost": -weights.lost * float(not outcome.tracking_ok),
-        "lost_for_good": -weights.lost_for_good * float(outcome.lost_for_good),
-        "blocked": -weights.blocked * float(outcome.blocked),
-    }
+    terms = {name: float(term) for name, term in weighted_terms(outcome, weights, targets).items()}
     if outcome.configuration_cost is not None:
         terms["compute"] = -weights.compute * outcome.configuration_cost
     return _without_minus_zero(terms)
+
+
+def weighted_terms(
+    outcome: Outcome, weights: RewardConfig, targets: TargetConfig
+) -> dict[str, Any]:
+    """The terms of `reward_terms` that every environment has, of one outcome or of B.
+
+    Of B outcomes the fields of ``outcome`` are arrays (B,), divergences (B, 2), and so the terms.
+    """
+    capped = np.minimum(targets.distances(outcome.divergence), _DISTANCE_CAP)
+    growth = np.clip(outcome.pose_error_growth_m, -_ERROR_CAP_M, _ERROR_CAP_M)
+    return {
+        "intensity_divergence": -weights.intensity_divergence * capped[..., 0],
+        "depth_divergence": -weights.depth_divergence * targets.depth_weight * capped[..., 1],
+        "trajectory_error": -weights.trajectory_error * growth,
+        "new_surface": weights.new_surface * outcome.new_surface_m2,
+        "lost": -weights.lost * np.logical_not(outcome.tracking_ok),
+        "lost_for_good": -weights.lost_for_good * np.asarray(outcome.lost_for_good),
+        "blocked": -weights.blocked * np.asarray(outcome.blocked),
+    }
 
 
 def _without_minus_zero(terms: dict[str, float]) -> dict[str, float]:

@@ -91,15 +91,33 @@ class RobotKnowledge:
 
 def state_vector(knowledge: RobotKnowledge) -> Float32:
     """The values of ``STATE_NAMES``, (28,) float32 of order one, clipped to their bounds."""
-    translation, rotation = divmod(knowledge.motion, NUM_ROTATIONS)
+    told = [knowledge.tracking_ok, knowledge.inlier_fraction, knowledge.lost_share]
+    own = knowledge.T_start_camera, knowledge.divergence, np.array(told, dtype=np.float64)
+    return state_vectors(*own, knowledge.motion)
+
+
+def state_vectors(
+    T_start_camera: Float64, divergence: Float64, told: Float64, motion: int | NDArray[np.int64]
+) -> Float32:
+    """State vectors (..., 28) of one robot or several; see ``RobotKnowledge``.
+
+    Args:
+        T_start_camera: (..., 4, 4).
+        divergence: (..., 2).
+        told: (..., 3) ``tracking_ok``, ``inlier_fraction`` and ``lost_share``.
+        motion: (...).
+    """
+    translation, rotation = divmod(motion, NUM_ROTATIONS)
+    axes = np.swapaxes(T_start_camera[..., :3, :2], -1, -2)
     state = np.concatenate(
         [
-            knowledge.T_start_camera[:3, 3] / POSITION_SCALE_M,
-            knowledge.T_start_camera[:3, :2].T.ravel(),
-            knowledge.divergence,
-            [knowledge.tracking_ok, knowledge.inlier_fraction, knowledge.lost_share],
+            T_start_camera[..., :3, 3] / POSITION_SCALE_M,
+            axes.reshape(*axes.shape[:-2], 6),
+            divergence,
+            told,
             np.eye(NUM_TRANSLATIONS)[translation],
             np.eye(NUM_ROTATIONS)[rotation],
-        ]
+        ],
+        axis=-1,
     ).astype(np.float32)
     return np.clip(state, *STATE_BOUNDS)

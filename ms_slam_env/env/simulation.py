@@ -29,7 +29,8 @@ from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sensor.scene_cache import get_scene, get_sensor
 from ms_slam_env.slam.slam_backend import SlamBackend, TrackResult
 
-_START_TRIES = 10  # a drawn start nearly always sees enough surface, so one try is enough
+START_TRIES = 10
+"""Starts drawn before an episode is refused; nearly always one sees enough surface."""
 
 
 @lru_cache(maxsize=4)
@@ -125,13 +126,13 @@ class Simulation:
         Raises:
             InputError: no usable pose in several tries.
         """
-        for _ in range(_START_TRIES):
+        for _ in range(START_TRIES):
             why = self.start_at(self.world.scene.sample_start(rng), rng)
             if not why:
                 return
         if self.config.arm.base is not None:
             why += "; give one with reset(options={'T_world_camera': ...})"
-        raise InputError(f"none of {_START_TRIES} drawn start poses can be used, the last: {why}")
+        raise InputError(f"none of {START_TRIES} drawn start poses can be used, the last: {why}")
 
     def start_at(self, start: Float64, rng: np.random.Generator) -> str:
         """Start at a pose (4, 4) with one frame; return why that failed, or an empty string."""

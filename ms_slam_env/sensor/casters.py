@@ -38,7 +38,11 @@ class RayCaster(ABC):
 
 
 class EmbreeRayCaster(RayCaster):
-    """Intel Embree on the CPU, one thread, packets of eight rays."""
+    """Intel Embree on the CPU, one thread, packets of eight rays.
+
+    Attributes:
+        packets: Embree's scene.
+    """
 
     def __init__(self, mesh: TexturedMesh) -> None:
         """Build Embree's acceleration structure.
@@ -49,7 +53,7 @@ class EmbreeRayCaster(RayCaster):
         library = embree_library()
         if library is None:
             raise OSError("the installed embreex does not give access to Embree 4's ray packets")
-        self._scene = PacketScene(library, mesh.vertices, mesh.faces)
+        self.packets = PacketScene(library, mesh.vertices, mesh.faces)
 
     def bind(
         self, poses: wp.array, camera: Pinhole, hits: Hits, shape: tuple[int, int, int]
@@ -57,7 +61,7 @@ class EmbreeRayCaster(RayCaster):
         """See the base class; the arrays live on the CPU."""
         batch, height, width = shape
         tiles = (batch, -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH))
-        scene = self._scene
+        scene = self.packets
         triangles = [scene.vertices, scene.faces]
         inputs = [scene.intersect, scene.scene, *triangles, poses, camera, hits]
         return RecordedLaunch(cast_tiles, tiles, inputs, "cpu").launch
@@ -93,12 +97,16 @@ class EmbreeSingleRayCaster(RayCaster):
 
 
 class WarpRayCaster(RayCaster):
-    """Warp's bounding volume hierarchy, on the CPU or on CUDA."""
+    """Warp's bounding volume hierarchy, on the CPU or on CUDA.
+
+    Attributes:
+        mesh: Warp's mesh.
+    """
 
     def __init__(self, mesh: TexturedMesh, device: str) -> None:
         """Build the hierarchy on ``device``."""
         self._device = device
-        self._mesh = wp.Mesh(
+        self.mesh = wp.Mesh(
             points=wp.array(mesh.vertices, dtype=wp.vec3, device=device),
             indices=wp.array(mesh.faces.ravel(), dtype=wp.int32, device=device),
         )
@@ -107,7 +115,7 @@ class WarpRayCaster(RayCaster):
         self, poses: wp.array, camera: Pinhole, hits: Hits, shape: tuple[int, int, int]
     ) -> Callable[[], None]:
         """See the base class; the arrays live on the device of the mesh."""
-        inputs = [self._mesh.id, poses, camera, hits]
+        inputs = [self.mesh.id, poses, camera, hits]
         return RecordedLaunch(cast_rays, shape, inputs, self._device).launch
 
 

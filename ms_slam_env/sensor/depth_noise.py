@@ -87,7 +87,7 @@ def projector_shadow(
         AXIAL_KNEE=_AXIAL_KNEE,
     )
 )
-def _measure_span(
+def measure_span(
     T: wp.mat44,
     camera: Pinhole,
     first: int,
@@ -104,7 +104,8 @@ def _measure_span(
     key_1: wp.uint32,
     normals: wp.array[wp.float32],
     depth: wp.array[wp.float32],
-) -> None: ...
+) -> None:
+    """Measure the depth of ``count`` pixels of a row."""
 
 
 @wp.kernel
@@ -125,7 +126,7 @@ def measure_depth(
     """Jitter, dropouts, range, axial noise, quantisation; one thread for ``span`` pixels."""
     b, y, part = wp.tid()
     x = part * span
-    _measure_span(
+    measure_span(
         T_world_camera[pose_of_row(camera, b, y)],
         camera,
         b * camera.height * camera.width,

@@ -121,7 +121,7 @@ TILE_HEIGHT = 2
 
 
 @wp.func_native(native_source("packet_casting", "cast_tile"))
-def _cast_tile(
+def cast_tile(
     intersect: wp.uint64,
     scene: wp.uint64,
     vertices: wp.array[wp.vec3],
@@ -132,7 +132,8 @@ def _cast_tile(
     tile_y: int,
     tile_x: int,
     hits: Hits,
-) -> None: ...
+) -> None:
+    """Cast the eight rays of a tile."""
 
 
 @wp.kernel
@@ -148,4 +149,4 @@ def cast_tiles(
     """Find the first hit of each pixel's ray; face -1 if there is none; one thread per tile."""
     b, y, x = wp.tid()
     T = T_world_camera[pose_of_row(camera, b, 2 * y)]  # the rows of a tile share their pose
-    _cast_tile(intersect, scene, vertices, faces, T, camera, b, y, x, hits)
+    cast_tile(intersect, scene, vertices, faces, T, camera, b, y, x, hits)

@@ -108,16 +108,11 @@ def generate_rays(
     directions[i] = world_ray(T, camera, x, y)
 
 
-@wp.kernel
-def cast_rays(
-    mesh: wp.uint64,
-    T_world_camera: wp.array[wp.mat44],  # (B * poses an image,)
-    camera: Pinhole,
-    hits: Hits,  # of B * H * W rays
+@wp.func
+def cast_ray(
+    mesh: wp.uint64, T: wp.mat44, camera: Pinhole, b: int, y: int, x: int, hits: Hits
 ) -> None:
-    """Find the first hit of each pixel's ray; face -1 if there is none."""
-    b, y, x = wp.tid()
-    T = T_world_camera[pose_of_row(camera, b, y)]
+    """Find the first hit of a pixel's ray; face -1 if there is none."""
     i = (b * camera.height + y) * camera.width + x
     ray = world_ray(T, camera, x, y)
     query = wp.mesh_query_ray(mesh, camera_centre(T), ray, 1.0e6)
@@ -129,6 +124,18 @@ def cast_rays(
         hits.face[i] = query.face
     else:
         hits.face[i] = -1
+
+
+@wp.kernel
+def cast_rays(
+    mesh: wp.uint64,
+    T_world_camera: wp.array[wp.mat44],  # (B * poses an image,)
+    camera: Pinhole,
+    hits: Hits,  # of B * H * W rays
+) -> None:
+    """Find the first hit of each pixel's ray; face -1 if there is none."""
+    b, y, x = wp.tid()
+    cast_ray(mesh, T_world_camera[pose_of_row(camera, b, y)], camera, b, y, x, hits)
 
 
 @wp.kernel

@@ -23,6 +23,7 @@ from ms_slam_env.sensor.images import Changes, Images, upload_surfaces, upload_t
 from ms_slam_env.sensor.native import frame_key
 from ms_slam_env.sensor.noise import NoiseConfig, noise_config
 from ms_slam_env.sensor.rays import make_pinhole
+from ms_slam_env.sensor.shading import Surfaces
 
 FRAME_RATE_HZ = 30.0
 """Rate of the simulated sensor; sets a frame's time stamp if the caller gives none."""
@@ -270,6 +271,11 @@ class RGBDSensor:
     def caster(self) -> RayCaster:
         """The ray caster."""
         return self._caster
+
+    @property
+    def surfaces(self) -> Surfaces:
+        """What shading needs of the scene's mesh."""
+        return self._surfaces
 
     def last_true_depth(self, moving: bool = True) -> NDArray[np.float32]:
         """True depth (H, W) of the frame that this thread captured last, metres; 0 = no surface.

@@ -33,18 +33,27 @@ def get_scene(name: SceneName, seed: int) -> Scene:
 
 
 def get_sensor(
-    name: SceneName, seed: int, intrinsics: Intrinsics, noise: str | NoiseConfig
+    name: SceneName,
+    seed: int,
+    intrinsics: Intrinsics,
+    noise: str | NoiseConfig,
+    device: str = "cpu",
 ) -> RGBDSensor:
-    """Get a sensor in that scene; each environment sets its noise seed."""
+    """Get a sensor in that scene, on ``device``; each environment sets its noise seed."""
     with _lock:
         scene, sensors = _place(name, seed)
-        key = intrinsics, noise
+        key = intrinsics, noise, device
         sensor = sensors.pop(key, None)
         if sensor is None:
-            alike = next(
-                (one for (camera, _), one in sensors.items() if camera == intrinsics), None
-            )
-            sensor = alike.with_noise(noise) if alike else RGBDSensor(scene, intrinsics, noise)
+            alike = [
+                one
+                for (camera, _, where), one in sensors.items()
+                if (camera, where) == (intrinsics, device)
+            ]
+            if alike:
+                sensor = alike[0].with_noise(noise)
+            else:
+                sensor = RGBDSensor(scene, intrinsics, noise, device=device)
         while len(sensors) >= SENSORS_KEPT:
             del sensors[next(iter(sensors))]
         sensors[key] = sensor

@@ -45,7 +45,7 @@ class Tables:
 @wp.func_native(
     native_source("shading", "shade_span", ENCODE_STEPS=float(ENCODE_STEPS), MIN_COSINE=_MIN_COSINE)
 )
-def _shade_span(
+def shade_span(
     T: wp.mat44,
     camera: Pinhole,
     first: int,
@@ -61,7 +61,8 @@ def _shade_span(
     key_1: wp.uint32,
     tables: Tables,
     color: wp.array2d[wp.uint8],
-) -> None: ...
+) -> None:
+    """Shade ``count`` pixels of a row."""
 
 
 @wp.kernel
@@ -83,7 +84,7 @@ def shade(
     first = b * camera.height * camera.width
     x = part * span
     count = wp.min(span, camera.width - x)
-    _shade_span(
+    shade_span(
         T_world_camera[pose_of_row(camera, b, y)],
         camera,
         first,

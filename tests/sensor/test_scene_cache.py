@@ -12,7 +12,7 @@ from ms_slam_env.sensor import scene_cache
 class Sensor:
     made = 0
 
-    def __init__(self, scene, intrinsics, noise):
+    def __init__(self, scene, intrinsics, noise, device="cpu"):
         self.noise = noise
         Sensor.made += 1
 

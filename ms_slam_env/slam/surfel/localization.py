@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env._runtime.arrays import Float64, Int32
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import adjoint, invert, se3_log
@@ -182,8 +182,8 @@ class CameraStates(Stateful):
         self._own["usual"][env] = usual
         self._own["photometry"][env]["reference"] = reference
 
-    def count(self, frames: int = 1) -> None:
-        """Count frames of every env; -1 takes the last one back."""
+    def count(self, frames: int | Int32 = 1) -> None:
+        """Count frames of every env, or (B,) of each; -1 takes the last one back."""
         self._own["time"] += frames
 
     def set_time(self, env: int, frame: int) -> None:

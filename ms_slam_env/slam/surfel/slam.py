@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env._runtime.arrays import Bool, Float64
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.camera import Intrinsics
 from ms_slam_env.geometry import check_pose, invert
@@ -164,6 +164,30 @@ class BatchedSurfelSlam(Saved):
         self._last_frames.keep(still, self.poses, found.tracking_ok)
         self._fuse(live, frames, found.fused)
         return self._close_loops(live, frames, found)
+
+    def can_start(self, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> Bool:
+        """Which frames (B,) show enough to start a map: colour (B, H, W, 3), depth (B, H, W)."""
+        live = self.preprocess(color, depth)
+        shares = (live.depth.numpy() > 0).reshape(self.batch, -1).mean(axis=1)
+        enough: Bool = shares >= FEWEST_READINGS
+        return enough
+
+    def start(self, color: NDArray[np.uint8], depth: NDArray[np.float32], where: Bool) -> None:
+        """Take the first frames of the envs ``where`` (B,), as ``track`` would; see ``can_start``.
+
+        Those envs were reset and their frames can start a map. The others stay as they are, without
+        a frame.
+        """
+        states = self._states
+        frames = Images(color, depth)
+        live = self.preprocess(color, depth)
+        self._invalid_frames.find(color, states.started | ~where)
+        for env in np.flatnonzero(where):
+            states.start(int(env))
+        self._correct_exposure(live, states.photometry)
+        self._last_frames.keep(color, depth, self.poses, where)
+        self._fuse(live, frames, where)
+        states.count(-(~where).astype(np.int32))
 
     def fuse(
         self,
