@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -75,17 +74,6 @@ _OF_SLAM = {
     "readout_s": 0.0,
     "color_registration": "given",
 }
-
-
-@dataclass(frozen=True)
-class _Tracked:
-    """What SLAM found for one frame of each of B cameras; see ``TrackResult``."""
-
-    T_world_camera: Float64
-    tracking_ok: Bool
-    fused: Bool
-    inlier_fraction: Float64
-    covariance: Float64  # (B, 6, 6); NaN where there is none
 
 
 class BatchedActiveSlam(VectorEnv[Float32, Int64, Any]):
@@ -359,31 +347,17 @@ class BatchedActiveSlam(VectorEnv[Float32, Int64, Any]):
     def _track(self, starts: Bool) -> Float64:
         """Track and measure the frames; return the newly mapped areas (B,), m2."""
         with self._stage("slam"):
-            found = self._tracked()
+            found = self.slam.track_arrays(*self._images())
         divergence = self._measure(starts)
         self._episodes.record(~starts, found, divergence)
         self._episodes.begin(starts)
         with self._stage("coverage"):
             return self._worlds.cover(self._episodes.T_world_camera_estimate, found.fused)
 
-    def _tracked(self) -> _Tracked:
-        """What SLAM finds in the last frames."""
-        results = self.slam.track(*self._images())
-        unknown = np.full((6, 6), np.nan)
-        return _Tracked(
-            T_world_camera=np.stack([result.T_world_camera for result in results]),
-            tracking_ok=np.array([result.tracking_ok for result in results]),
-            fused=np.array([result.fused for result in results]),
-            inlier_fraction=np.array([result.inlier_fraction for result in results]),
-            covariance=np.stack(
-                [unknown if one.covariance is None else one.covariance for one in results]
-            ),
-        )
-
     def _images(self) -> Any:
-        """Colour and depth of the last frames."""
+        """Colour and depth of the last frames, on the device."""
         cameras = self._worlds.cameras
-        return cameras.color.numpy(), cameras.depth.numpy()
+        return cameras.color, cameras.depth
 
     def _measure(self, starts: Bool) -> Float64:
         """(B, 2) divergence of the last frames from the ones before; 0 for first ones."""

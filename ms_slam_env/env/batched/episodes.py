@@ -2,33 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from ms_slam_env._runtime.arrays import Bool, Float64, Int64
 from ms_slam_env.geometry import invert
 from ms_slam_env.robot.embodiment import FRAME_PERIOD_S
-
-
-class Tracked(Protocol):
-    """What SLAM found for one frame of each of B cameras."""
-
-    @property
-    def T_world_camera(self) -> Float64:
-        """(B, 4, 4) estimated poses."""
-
-    @property
-    def tracking_ok(self) -> Bool:
-        """(B,) whether the pose is known."""
-
-    @property
-    def inlier_fraction(self) -> Float64:
-        """(B,) share of the pixels that the alignment explains."""
-
-    @property
-    def covariance(self) -> Float64:
-        """(B, 6, 6) of the poses; NaN where there is none."""
+from ms_slam_env.slam.surfel.tracked_batch import TrackedBatch
 
 
 class Episodes:
@@ -93,7 +74,7 @@ class Episodes:
         self.pose_error = np.where(where, 0.0, self.pose_error)
         self.tracking_ok = self.tracking_ok | where
 
-    def record(self, where: Bool, found: Tracked, divergence: Float64) -> None:
+    def record(self, where: Bool, found: TrackedBatch, divergence: Float64) -> None:
         """Record the frames of the episodes ``where`` (B,) that moved, and their divergences."""
         there = where[:, None, None]
         self.T_world_camera_estimate = np.where(

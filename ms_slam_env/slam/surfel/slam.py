@@ -165,27 +165,26 @@ class BatchedSurfelSlam(Saved):
         self._fuse(live, frames, found.fused)
         return self._close_loops(live, frames, found)
 
-    def can_start(self, color: NDArray[np.uint8], depth: NDArray[np.float32]) -> Bool:
-        """Which frames (B,) show enough to start a map: colour (B, H, W, 3), depth (B, H, W)."""
-        live = self.preprocess(color, depth)
-        shares = (live.depth.numpy() > 0).reshape(self.batch, -1).mean(axis=1)
-        enough: Bool = shares >= FEWEST_READINGS
+    def can_start(self, color: Any, depth: Any) -> Bool:
+        """Which frames (B,) show enough to start a map; images as in ``track_arrays``."""
+        images = images_of(color, depth, self.map.device)
+        live = self.preprocess(images.color, images.depth)
+        enough: Bool = _readings(live, np.ones(self.batch, dtype=bool)) >= FEWEST_READINGS
         return enough
 
-    def start(self, color: NDArray[np.uint8], depth: NDArray[np.float32], where: Bool) -> None:
+    def start(self, color: Any, depth: Any, where: Bool) -> None:
         """Take the first frames of the envs ``where`` (B,), as ``track`` would; see ``can_start``.
 
         Those envs were reset and their frames can start a map. The others stay as they are, without
         a frame.
         """
         states = self._states
-        frames = Images(color, depth)
-        live = self.preprocess(color, depth)
-        self._invalid_frames.find(color, states.started | ~where)
-        for env in np.flatnonzero(where):
-            states.start(int(env))
+        frames = images_of(color, depth, self.map.device)
+        live = self.preprocess(frames.color, frames.depth)
+        self._invalid_frames.find(frames, states.started | ~where)
+        states.start(where)
         self._correct_exposure(live, states.photometry)
-        self._last_frames.keep(color, depth, self.poses, where)
+        self._last_frames.keep(frames, self.poses, where)
         self._fuse(live, frames, where)
         states.count(-(~where).astype(np.int32))
 
