@@ -33,9 +33,10 @@ from ms_slam_agents.trainers import ImitationArgs as Args
 from ms_slam_agents.trainers import imitation as main
 from ms_slam_agents.training_run import alone, read_run, read_similar, saved_curve
 
-from ms_slam_env._runtime.parallel import one_thread_unless_set, open_pool, run_each
+from ms_slam_env._runtime.parallel import open_pool, run_each
 from ms_slam_env._runtime.progress import Bar
 from ms_slam_env._runtime.result_folders import own_folder
+from ms_slam_env._runtime.threads import one_thread_unless_set
 from ms_slam_env.config import parse_named
 from ms_slam_env.env.planners import PLANNERS, check_planner
 from ms_slam_env.errors import InputError

@@ -10,7 +10,7 @@ import numpy as np
 from ms_slam_experiments.difficulty import MOTIONS, watch_frames
 
 from ms_slam_env import metrics, slam
-from ms_slam_env._runtime.parallel import limit_threads
+from ms_slam_env._runtime.threads import limit_threads
 from ms_slam_env.benchmark.compare import DEFAULT_SEQUENCES
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.config import Checked, bounded

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env import metrics, sequences, slam
-from ms_slam_env._runtime.parallel import limit_threads
+from ms_slam_env._runtime.threads import limit_threads
 from ms_slam_env.benchmark.episode_scores import LOST_ERROR_M
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env import metrics, scenes, sequences
-from ms_slam_env._runtime.parallel import limit_threads
+from ms_slam_env._runtime.threads import limit_threads
 from ms_slam_env.benchmark.episodes import seed_list
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import xtion

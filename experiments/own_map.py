@@ -12,7 +12,7 @@ from ms_slam_experiments.relocalization import FOUND_M, Interruption, interrupt
 from ms_slam_experiments.robustness import Robustness, RobustnessSpec
 
 from ms_slam_env import slam
-from ms_slam_env._runtime.parallel import limit_threads
+from ms_slam_env._runtime.threads import limit_threads
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.config import Checked, bounded, parse_named
 from ms_slam_env.evaluation.run_sequence import run_sequence

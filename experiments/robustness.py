@@ -11,7 +11,7 @@ import numpy as np
 
 from ms_slam_env import metrics, slam
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env._runtime.parallel import limit_threads
+from ms_slam_env._runtime.threads import limit_threads
 from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.camera import RGBDFrame, parse_image_size
 from ms_slam_env.camera.image_size import NATIVE

@@ -18,7 +18,7 @@ import numpy as np
 from ms_slam_experiments.shared import slam_speed_child
 
 from ms_slam_env import scenes, sequences, slam
-from ms_slam_env._runtime.parallel import thread_environment
+from ms_slam_env._runtime.threads import thread_environment
 from ms_slam_env.benchmark.experiment import Experiment, check_names
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded, check_range, parse_named

@@ -16,7 +16,7 @@ import numpy as np
 from ms_slam_experiments.slam_batch import device_bytes
 
 import ms_slam_env  # noqa: F401 -- registers the environments
-from ms_slam_env._runtime.parallel import available_cores
+from ms_slam_env._runtime.threads import available_cores
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import xtion

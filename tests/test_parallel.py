@@ -12,14 +12,8 @@ from pathlib import Path
 import pytest
 from parallel_work import work
 
-from ms_slam_env._runtime.parallel import (
-    Outcome,
-    available_cores,
-    limited_threads,
-    open_pool,
-    run_each,
-    thread_environment,
-)
+from ms_slam_env._runtime.parallel import Outcome, open_pool, run_each
+from ms_slam_env._runtime.threads import available_cores, limited_threads, thread_environment
 from ms_slam_env.errors import InputError
 
 

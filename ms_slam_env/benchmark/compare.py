@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env import metrics, slam
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env._runtime.parallel import limit_threads, thread_environment
+from ms_slam_env._runtime.threads import limit_threads, thread_environment
 from ms_slam_env.benchmark.command_runs import (
     check_command,
     command_of,

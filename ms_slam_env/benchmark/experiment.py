@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from ms_slam_env._runtime.extension import ExtensionPoint
-from ms_slam_env._runtime.parallel import one_thread_unless_set
+from ms_slam_env._runtime.threads import one_thread_unless_set
 from ms_slam_env.config import parse_named
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.report.charts import Chart

@@ -17,9 +17,10 @@ from typing import Any
 from ms_slam_env._runtime.interrupts import kept
 from ms_slam_env._runtime.output_files import check_out_folder
 from ms_slam_env._runtime.parallel import Outcome as Done
-from ms_slam_env._runtime.parallel import one_thread_unless_set, open_pool, run_each
+from ms_slam_env._runtime.parallel import open_pool, run_each
 from ms_slam_env._runtime.progress import Bar
 from ms_slam_env._runtime.result_folders import alone_in
+from ms_slam_env._runtime.threads import one_thread_unless_set
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.benchmark.planner_tables import with_privilege
 from ms_slam_env.errors import InputError, one_line

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ms_slam_env import metrics, scenes, slam
 from ms_slam_env._runtime.arrays import Float64
-from ms_slam_env._runtime.parallel import limit_threads, thread_environment
+from ms_slam_env._runtime.threads import limit_threads, thread_environment
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import RGBDFrame, rendered_size, xtion
 from ms_slam_env.config import Checked, bounded, parse_named

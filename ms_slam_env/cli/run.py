@@ -84,7 +84,7 @@ def main(arguments: Sequence[str]) -> int:
         from ms_slam_env.slam.registry import POINT
 
         POINT.find(args.backend)  # report a typo before the slow imports
-    from ms_slam_env._runtime.parallel import limit_threads
+    from ms_slam_env._runtime.threads import limit_threads
     from ms_slam_env.camera.image_size import ImageSizeError
     from ms_slam_env.config import from_dict, nested_options
     from ms_slam_env.evaluation.run_sequence import lost_throughout

@@ -13,7 +13,7 @@ import yaml
 
 from ms_slam_env._runtime.input_files import read_text
 from ms_slam_env._runtime.output_files import write_text
-from ms_slam_env._runtime.parallel import limited_threads
+from ms_slam_env._runtime.threads import limited_threads
 from ms_slam_env.camera import Intrinsics, parse_image_size
 from ms_slam_env.config import Checked, bounded, from_dict, load_yaml
 from ms_slam_env.errors import InputError, unknown
