@@ -123,7 +123,7 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     header, *rows = (out / "frames.csv").read_text().splitlines()
     assert header == (
         "timestamp,tracking_ok,ext_ms,cpu_ms,mem_mb,ene_j,"
-        "inlier_fraction,overlap,residual_m,degenerate_directions,reason"
+        "inlier_fraction,overlap,residual_m,degenerate_directions,reason,refusal"
     )
     assert written["ate_tracked_m"] == written["ate_m"]
     assert written["tracked_share"] == 1

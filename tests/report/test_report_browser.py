@@ -306,7 +306,7 @@ def test_a_logarithmic_axis_has_plain_numbers_and_the_mode_bar_covers_nothing(
     assert labels[0] == ["5", "10", "20", "50", "100", "200", "500"]
     assert len(labels[1]) > 3
     assert all(12 <= float(label) <= 30 for label in labels[1])
-    assert labels[2] == ["0.01", "0.1", "1", "10", "100", "1000", "10000"]
+    assert labels[2] == ["0.01", "0.1", "1", "10", "100", "1,000", "10,000"]
     page.hover(".canvas >> nth=0")
     bar = page.locator(".modebar").first.bounding_box()
     plot = page.locator(".canvas .nsewdrag").first.bounding_box()
