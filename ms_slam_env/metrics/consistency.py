@@ -41,6 +41,17 @@ def pose_twists(estimate: ArrayLike, truth: ArrayLike) -> Float64:
     return np.array([se3_log(T) for T in relative]).reshape(-1, 6)
 
 
+def _checked(
+    estimate: ArrayLike, truth: ArrayLike, covariances: ArrayLike
+) -> tuple[Float64, Float64, Float64]:
+    """Poses, true poses (N, 4, 4) and covariances (N, 6, 6)."""
+    poses, true_poses = check_pair(estimate, truth)
+    C = as_numbers(covariances, "covariances")
+    if C.shape != (len(poses), 6, 6):
+        raise InputError(f"covariances must be ({len(poses)}, 6, 6), got {C.shape}")
+    return poses, true_poses, C
+
+
 def motion_twists(
     estimate: ArrayLike, truth: ArrayLike, covariances: ArrayLike, first: Int64, second: Int64
 ) -> tuple[Float64, Float64]:
@@ -64,10 +75,7 @@ def motion_twists(
     Raises:
         InputError: wrong shapes, lengths that differ, NaN in poses.
     """
-    poses, true_poses = check_pair(estimate, truth)
-    C = as_numbers(covariances, "covariances")
-    if C.shape != (len(poses), 6, 6):
-        raise InputError(f"covariances must be ({len(poses)}, 6, 6), got {C.shape}")
+    poses, true_poses, C = _checked(estimate, truth, covariances)
     motions = invert(poses[first]) @ poses[second]
     true_motions = invert(true_poses[first]) @ true_poses[second]
     carry = adjoint(invert(motions))
@@ -130,10 +138,7 @@ def silently_wrong(
     Raises:
         InputError: wrong shapes, lengths that differ, NaN in poses.
     """
-    poses, true_poses = check_pair(estimate, truth)
-    C = as_numbers(covariances, "covariances")
-    if C.shape != (len(poses), 6, 6):
-        raise InputError(f"covariances must be ({len(poses)}, 6, 6), got {C.shape}")
+    poses, true_poses, C = _checked(estimate, truth, covariances)
     errors = np.linalg.norm(poses[:, :3, 3] - true_poses[:, :3, 3], axis=1)
     deviations = np.sqrt(np.trace(C[:, :3, :3], axis1=1, axis2=2))
     return (errors > distance_m) & (errors > sigmas * deviations)

@@ -235,7 +235,7 @@ _DEMANDS: dict[int, tuple[tuple[str, str, bool], ...]] = {
     ),
     TrackingStatus.IMPLAUSIBLE_MOTION: (
         ("motion_m", "motion in metres", False),
-        ("rotation_cos", "cosine of the rotation", True),
+        ("rotation_cos", "rotation in degrees", True),
     ),
 }
 """Each status to the statistics that it may be due to: field, words, whether least is demanded."""
@@ -255,6 +255,9 @@ def failed_demand(statistics: Any, thresholds: Any, status: int) -> str:
     for name, words, is_least in _DEMANDS.get(status, ()):
         found, demanded = _field(statistics, name), _field(thresholds, name)
         if found < demanded if is_least else found > demanded:
+            if name == "rotation_cos":  # the larger the angle, the smaller its cosine
+                found, demanded = np.degrees(np.arccos(np.clip([found, demanded], -1.0, 1.0)))
+                is_least = False
             return f"{words} {found:.3g}, at {'least' if is_least else 'most'} {demanded:.3g}"
     return ""
 
