@@ -11,6 +11,7 @@ from ms_slam_experiments.robustness import (
     Robustness,
     RobustnessSpec,
     consistency,
+    default_sequences,
     judged,
     part_of,
 )
@@ -90,6 +91,21 @@ def test_what_is_run_by_default_exists() -> None:
     specs = made.specs()
     assert {part_of(spec.source) for spec in specs} == {"tuning", "judging"}
     assert len({spec.sequence for spec in specs}) == len(specs) == 2 * (6 + 10 + 8)
+
+
+@pytest.mark.parametrize("seed", Robustness().seeds)
+def test_the_person_walks_into_view(seed) -> None:
+    (name,) = (name for name in default_sequences(seed) if "kind=person" in name)
+    room = name.partition("+")[0]
+    walked, empty = (
+        RobustnessSpec(text, text, "", "80x60", "none", "surfel", 150).opened().frames
+        for text in (name, room)
+    )
+    shares = [
+        (np.abs(walked[index].depth - empty[index].depth) > 0.05).mean()
+        for index in range(0, 150, 10)
+    ]
+    assert sum(share > 0.01 for share in shares) >= 4
 
 
 def test_a_recording_is_named_with_its_folder() -> None:
