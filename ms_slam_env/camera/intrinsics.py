@@ -88,6 +88,16 @@ class Intrinsics:
         """The same camera without distortion."""
         return replace(self, distortion=NO_DISTORTION) if self.distortion else self
 
+    @property
+    def field(self) -> Float64:
+        """Tangents (2, 2) of the view: x / z at left and right, y / z at top and bottom border.
+
+        Those of a pinhole, rounded, so that every size of an image has the same.
+        """
+        middle = np.array([[self.cx], [self.cy]])
+        borders = np.array([[-0.5, self.width - 0.5], [-0.5, self.height - 0.5]])
+        return ((borders - middle) / [[self.fx], [self.fy]]).round(9)
+
     def check_pinhole(self, what: str) -> None:
         """Refuse lens distortion.
 

@@ -155,7 +155,7 @@ def test_what_moves_waits_for_the_camera_and_is_not_new_surface() -> None:
     T[:3, 3] = mover.middle(0.1)
     before = mover.pose(0.05)
     inner.camera_feed.set_trajectory(np.array([0.05, 0.1]), np.stack([T, T]))
-    np.testing.assert_array_equal(mover.pose(0.1), before)
+    np.testing.assert_allclose(mover.pose(0.1), before, atol=1e-12)
     truth = inner.camera_feed._camera.sensor.ground_truth(inner.episode.trajectory_truth[-1], 0.0)
     moving = truth.labels >= len(inner.scene.mesh.labels)
     inner.camera_feed.set_trajectory(np.zeros(1), inner.episode.trajectory_truth)

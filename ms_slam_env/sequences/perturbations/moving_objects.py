@@ -157,9 +157,10 @@ def _seen(
     """Share of the instants at which the camera sees its centre unoccluded."""
     middle = mover.middle(times)
     offsets = np.einsum("kji,kj->ki", poses[:, :3, :3], middle - poses[:, :3, 3])
-    u, v = intrinsics.project(offsets).T
-    is_inside = (offsets[:, 2] > 0.1) & (u > 0) & (u < intrinsics.width - 1)
-    is_inside &= (v > 0) & (v < intrinsics.height - 1)
+    is_ahead = offsets[:, 2] > 0.1
+    sideways = offsets[:, :2] / np.where(is_ahead, offsets[:, 2], 1.0)[:, None]
+    low, high = intrinsics.field.T
+    is_inside = is_ahead & ((sideways > low) & (sideways < high)).all(1)
     count = 0
     for k in np.flatnonzero(is_inside):
         eye = poses[k, :3, 3]
@@ -174,7 +175,9 @@ class Places:
         self, scene: Scene, camera: Float64, intrinsics: Intrinsics, rng: np.random.Generator
     ) -> None:
         """Prepare for the camera's poses (K, 4, 4)."""
-        self._scene, self._camera, self._K, self._rng = scene, camera, intrinsics, rng
+        self._scene, self._camera, self._rng = scene, camera, rng
+        self._low, high = intrinsics.field.T
+        self._span = high - self._low
         self._rays = RayCaster(scene.mesh.vertices, scene.mesh.faces)
         self._ground_z = self._ground()
 
@@ -219,11 +222,11 @@ class Places:
 
     def _points_in_view(self, kind: str, count: int) -> Float64:
         """Points (count, 3) in front of the camera's poses; on the ground for people and cars."""
-        rng, K = self._rng, self._K
+        rng = self._rng
         T = self._camera[rng.integers(len(self._camera), size=count)]
         z = rng.uniform(*_DEPTHS_M[kind], count)
-        x = (rng.uniform(0.1, 0.9, count) * K.width - K.cx) / K.fx
-        y = (rng.uniform(0.2, 0.8, count) * K.height - K.cy) / K.fy
+        x = self._low[0] + rng.uniform(0.1, 0.9, count) * self._span[0]
+        y = self._low[1] + rng.uniform(0.2, 0.8, count) * self._span[1]
         local = np.stack([x * z, y * z, z], -1)
         points = np.einsum("kij,kj->ki", T[:, :3, :3], local) + T[:, :3, 3]
         if kind != "box":  # in little space it may also start out of view
