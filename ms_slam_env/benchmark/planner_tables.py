@@ -156,8 +156,8 @@ def trainings_compared(
 
 
 def _best_first(scores: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
-    names = _ranked({name: statistics.interquartile_mean(of) for name, of in scores.items()})
-    return {name: scores[name] for name in names}
+    means = {name: statistics.interquartile_mean(of.reshape(-1)) for name, of in scores.items()}
+    return {name: scores[name] for name in _ranked(means)}
 
 
 def _two_by_two(

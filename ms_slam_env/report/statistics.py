@@ -6,12 +6,13 @@ The aggregates reproduce their library rliable 1.2.0 bit for bit, with the same 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ms_slam_env._runtime.arrays import Float64
 
@@ -29,12 +30,17 @@ class Interval:
     high: float
 
 
-def median_interval(values: ArrayLike) -> Interval:
+def median_interval(values: Iterable[float]) -> Interval:
     """Median and its percentile-bootstrap interval; NaN without values.
 
     Args:
         values: (n,) one per episode; with n = 1 the interval is the value itself.
     """
+    return _median_interval(tuple(values))
+
+
+@lru_cache(2048)  # one table repeats columns of another
+def _median_interval(values: tuple[float, ...]) -> Interval:
     return bootstrap_interval((values,), lambda x, axis: np.median(x, axis=axis))
 
 
@@ -102,11 +108,12 @@ def rank_correlation(a: ArrayLike, b: ArrayLike) -> float:
     return float(stats.spearmanr(a, b).statistic)
 
 
-def interquartile_mean(scores: Float64) -> float:
-    """Mean of the middle half of scores (episodes, scenes): rliable's ``aggregate_iqm``."""
-    ordered = np.sort(scores, axis=None)
-    cut = len(ordered) // 4
-    return float(ordered[cut : len(ordered) - cut].mean())
+def interquartile_mean(scores: Float64) -> Float64:
+    """Mean of the middle half of scores (..., n), (...): rliable's ``aggregate_iqm``."""
+    count = scores.shape[-1]
+    cut = count // 4
+    middle: Float64 = np.sort(scores, axis=-1)[..., cut : count - cut].mean(axis=-1)
+    return middle
 
 
 def interquartile_means(scores: Mapping[str, Float64]) -> dict[str, Interval]:
@@ -116,10 +123,13 @@ def interquartile_means(scores: Mapping[str, Float64]) -> dict[str, Interval]:
         scores: planner to (episodes, scenes).
     """
     rng = np.random.RandomState(0)
-    return {
-        name: _stratified_bootstrap([of], lambda x: np.array([interquartile_mean(x)]), rng)[0]
-        for name, of in scores.items()
-    }
+    found = {}
+    for name, of in scores.items():
+        (drawn,) = _stratified_draws([of], rng)
+        resampled = np.take_along_axis(of[None], drawn, axis=1).reshape(_RESAMPLES, -1)
+        limits = np.percentile(interquartile_mean(resampled), _PERCENTILES)
+        found[name] = Interval(*map(float, (interquartile_mean(of.reshape(-1)), *limits)))
+    return found
 
 
 def improvement_matrix(scores: Mapping[str, Float64]) -> dict[tuple[str, str], Interval]:
@@ -131,13 +141,12 @@ def improvement_matrix(scores: Mapping[str, Float64]) -> dict[tuple[str, str], I
     Args:
         scores: planner to (episodes, scenes); planners may differ in their episodes.
     """
-
-    def of_all(*resampled: Float64) -> Float64:
-        by_scene = [np.ascontiguousarray(of.T) for of in resampled]  # long rows are compared faster
-        return np.array([_improvement(a, b) for a, b in combinations(by_scene, 2)])
-
-    found = _stratified_bootstrap(list(scores.values()), of_all, np.random.RandomState(0))
-    return _both_ways(dict(zip(combinations(scores, 2), found, strict=True)))
+    draws = _stratified_draws(list(scores.values()), np.random.RandomState(0))
+    weights = {
+        name: (drawn.T[..., None] == np.arange(len(of))).sum(1, dtype=np.float64)
+        for (name, of), drawn in zip(scores.items(), draws, strict=True)
+    }
+    return _improvements({name: of.T for name, of in scores.items()}, weights)
 
 
 def improvement_of_trainings(scores: Mapping[str, Float64]) -> dict[tuple[str, str], Interval]:
@@ -153,58 +162,49 @@ def improvement_of_trainings(scores: Mapping[str, Float64]) -> dict[tuple[str, s
     rng = np.random.default_rng(0)
     by_scene = {name: of.reshape(-1, of.shape[2]).T for name, of in scores.items()}
     weights = {name: _hierarchical_weights(rng, *of.shape) for name, of in scores.items()}
+    return _improvements(by_scene, weights)
+
+
+def _improvements(
+    scores: Mapping[str, Float64], weights: Mapping[str, Float64]
+) -> dict[tuple[str, str], Interval]:
+    """P(one planner scores higher than another), all ordered pairs.
+
+    Args:
+        scores: planner to (scenes, n).
+        weights: how often each resample drew each score, planner to (scenes, resamples, n).
+    """
     pairs = {}
     for a, b in combinations(scores, 2):
-        order = np.sign(by_scene[a][:, :, None] - by_scene[b][:, None])
-        drawn = np.einsum("rsi,sij,rsj->r", weights[a], order, weights[b], optimize=True)
-        low, high = np.percentile(drawn / order.size, _PERCENTILES)
-        pairs[a, b] = Interval(*(float(0.5 + 0.5 * of) for of in (order.mean(), low, high)))
-    return _both_ways(pairs)
+        order = np.sign(scores[a][:, :, None] - scores[b][:, None])
+        won = (weights[a] @ order * weights[b]).sum(axis=(0, 2))
+        low, high = np.percentile(0.5 + 0.5 * won / order.size, _PERCENTILES)
+        pairs[a, b] = Interval(float(0.5 + 0.5 * order.mean()), float(low), float(high))
+    back = {(b, a): Interval(1 - p.value, 1 - p.high, 1 - p.low) for (a, b), p in pairs.items()}
+    return {**pairs, **back}
 
 
 def _hierarchical_weights(
     rng: np.random.Generator, policies: int, episodes: int, scenes: int
 ) -> Float64:
-    """How often each resample drew each episode, (resamples, scenes, policies * episodes)."""
+    """How often each resample drew each episode, (scenes, resamples, policies * episodes)."""
     drawn = rng.multinomial(policies, np.full(policies, 1 / policies), _RESAMPLES)[:, None]
     of_scenes = np.repeat(drawn * episodes, scenes, axis=1)
     counts = rng.multinomial(of_scenes, np.full(episodes, 1 / episodes))
-    return counts.reshape(_RESAMPLES, scenes, -1).astype(np.float64)
+    return counts.reshape(_RESAMPLES, scenes, -1).swapaxes(0, 1).astype(np.float64)
 
 
-def _both_ways(pairs: Mapping[tuple[str, str], Interval]) -> dict[tuple[str, str], Interval]:
-    """The pairs, and each pair reversed."""
-    back = {(b, a): Interval(1 - p.value, 1 - p.high, 1 - p.low) for (a, b), p in pairs.items()}
-    return {**pairs, **back}
-
-
-def _improvement(a: Float64, b: Float64) -> float:
-    """rliable's ``probability_of_improvement`` of scores (scenes, m) over (scenes, n)."""
-    a, b = a[:, :, None], b[:, None]
-    more, less = np.count_nonzero(a > b), np.count_nonzero(a < b)
-    return 0.5 + 0.5 * (more - less) / (a.size * b.shape[2])
-
-
-def _stratified_bootstrap(
-    scores: Sequence[Float64],
-    aggregate: Callable[..., Float64],
-    rng: np.random.RandomState,
-) -> list[Interval]:
-    """Percentile intervals of the values (k,) that ``aggregate`` computes from ``scores``.
-
-    A resample redraws the episodes of each planner and scene from the same random stream as
-    rliable, so that tables made with it do not change.
+def _stratified_draws(
+    scores: Sequence[Float64], rng: np.random.RandomState
+) -> list[NDArray[np.int64]]:
+    """The episodes of each planner and scene that each resample draws, from rliable's stream.
 
     Args:
         scores: one array (episodes, scenes) per planner.
-        aggregate: function of as many resampled arrays.
         rng: source of the draws.
+
+    Returns:
+        One array (resamples, episodes, scenes) per planner.
     """
-    drawn = np.array(
-        [
-            aggregate(*(np.take_along_axis(of, rng.choice(len(of), of.shape), 0) for of in scores))
-            for _ in range(_RESAMPLES)
-        ]
-    )
-    limits = np.percentile(drawn, _PERCENTILES, axis=0)
-    return [Interval(*map(float, of)) for of in zip(aggregate(*scores), *limits, strict=True)]
+    drawn = [[rng.choice(len(of), of.shape) for of in scores] for _ in range(_RESAMPLES)]
+    return [np.array(of) for of in zip(*drawn, strict=True)]
