@@ -44,8 +44,8 @@ types: $(STAMP)
 	$(BIN)/mypy
 
 test: lint types
-	$(BIN)/pytest -n $(WORKERS)
-	MS_SLAM_ENV_CHECKED=1 $(BIN)/pytest -n $(WORKERS) $(CHECKED_TESTS)
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal
+	MS_SLAM_ENV_CHECKED=1 $(BIN)/pytest -n $(WORKERS) --dist worksteal $(CHECKED_TESTS)
 
 # Planners in four rooms: the ends of what there is, the paper's, the classical one, the agent shipped.
 benchmark: $(STAMP)
