@@ -14,6 +14,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.vector import AutoresetMode
+from ms_slam_agents.batched_venv import BatchedVecEnv
 from ms_slam_agents.curriculum import Staged, read_curriculum
 from ms_slam_agents.evaluation import FixedEpisodes
 from ms_slam_agents.options import Problem, Training, world_of
@@ -23,8 +25,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 import ms_slam_env  # registers the ids, in a worker process too
 from ms_slam_env.env.reward import RewardConfig
 from ms_slam_env.errors import InputError, unknown
+from ms_slam_env.gym_ids import BATCHED_IDS
 
 VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws from small seeds
+
+_STARTS_A_SCENE = 32  # of environments in a batch, drawn when a scene is first entered
 
 
 def make_env(
@@ -167,6 +172,8 @@ def env_options(args: Problem) -> dict[str, Any]:
 
 def make_venv(args: Problem, split: str, seeds: Sequence[int] = ()) -> VecEnv:
     """Build the parallel environments; the episodes ``seeds`` are dealt out to them in turn."""
+    if split == "train" and isinstance(args, Training) and args.batched != "no":
+        return _make_batch(args)
     num_envs = min(args.num_envs, len(seeds)) if seeds else args.num_envs
 
     def maker(rank: int) -> Callable[[], gym.Env[Any, Any]]:
@@ -177,3 +184,16 @@ def make_venv(args: Problem, split: str, seeds: Sequence[int] = ()) -> VecEnv:
         return DummyVecEnv(makers)
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # inherited by the workers
     return SubprocVecEnv(makers, start_method="spawn")
+
+
+def _make_batch(args: Training) -> VecEnv:
+    """Build training environments that step at once on a device."""
+    batched_id = f"batched/{args.env_id}"
+    if batched_id not in BATCHED_IDS:
+        ids = [name.removeprefix("batched/") for name in BATCHED_IDS]
+        raise unknown("environment in a batch", args.env_id, ids)
+    options = problem_options(args, "train") | {"autoreset_mode": AutoresetMode.SAME_STEP}
+    envs = gym.make_vec(
+        batched_id, args.num_envs, device=args.batched, start_pool=_STARTS_A_SCENE, **options
+    )
+    return BatchedVecEnv(envs)

@@ -134,6 +134,8 @@ class Training(Problem):
         also: further tasks to train in, named like ``task``; the parallel environments alternate
             between the problem itself and these. Only their scenes, episode lengths and motions are
             used. Validation uses the problem alone.
+        batched: device on which all training environments step at once, in this process, for
+            `features` in `MSActiveSLAM-Room-v0` and `-FreeCamera-v0`; `no`: a process each.
     """
 
     init: Path | None = None
@@ -148,9 +150,17 @@ class Training(Problem):
     curriculum: Path | None = None
     episodes_per_scene: int = bounded(5, 1, 1_000_000)
     also: tuple[str, ...] = ()
+    batched: str = chosen("no", "no", "cpu", "cuda")
 
     kept: ClassVar[tuple[str, ...]] = ()
     """Options beside `resume.KEPT` that a run keeps when it is resumed."""
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range, and what a batch does not have."""
+        super().__post_init__()
+        for name in ("also", "curriculum", "through") if self.batched != "no" else ():
+            if getattr(self, name):
+                raise InputError(f"batched = {self.batched!r}: a batch has no {name}")
 
 
 @dataclass(frozen=True)

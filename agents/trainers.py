@@ -192,6 +192,8 @@ class RllibArgs(PpoTraining):
     def __post_init__(self) -> None:
         """Refuse values out of range, and a batch that is larger than a round."""
         super().__post_init__()
+        if self.batched != "no":
+            raise InputError("batched: the runners of Ray step their environments one by one")
         if self.batch_size > self.round_steps:
             raise InputError(
                 f"batch_size = {self.batch_size} is larger than a round of {self.round_steps} "
