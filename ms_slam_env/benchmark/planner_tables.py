@@ -156,7 +156,9 @@ def trainings_compared(
 
 
 def _best_first(scores: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
-    means = {name: statistics.interquartile_mean(of.reshape(-1)) for name, of in scores.items()}
+    means = {
+        name: float(statistics.interquartile_mean(of.reshape(-1))) for name, of in scores.items()
+    }
     return {name: scores[name] for name in _ranked(means)}
 
 
