@@ -166,6 +166,8 @@ def _paragraphs(cls: type) -> list[str]:
     return [" ".join(part.split()) for part in text.strip().split("\n\n")]
 
 
+IN_A_CLONE = "clone the project and pip install -e ."
+"""How to get what a wheel leaves out."""
 _RESEARCH = importlib.util.find_spec("ms_slam_experiments")
 HAS_RESEARCH = _RESEARCH is not None
 """Whether this is a checkout, which also has the project's research experiments."""
