@@ -40,7 +40,6 @@ KEYS = (
 )
 MOVING, STILL = "moving", "still"
 _WARM_UP = 5  # frames left out of the timing
-_SHOWN, _PER_ROW = 12, 6  # frames of the picture
 
 
 @dataclass(frozen=True)
@@ -145,17 +144,6 @@ class MovingObjectsExperiment(Experiment, Checked):
         caption = "One mark a sequence in which something moves."
         return [Chart("moving_objects", "Error against time", caption, [panel])]
 
-    def write_pictures(self, rows: Sequence[Row], out: Path) -> None:
-        """The mask on frames of the sequence with the most motion."""
-        from ms_slam_experiments.pictures.stills import save_image
-
-        moving = [row for row in finished(rows) if row["result"]["moving_share"] > 0]
-        if not moving or MASKED not in self.backends:
-            return
-        most = max(moving, key=lambda row: row["result"]["moving_share"])["spec"]["sequence"]
-        spec = MovingObjectsSpec(most, (), self.image_size, self.frames)
-        save_image(out / "mask.png", _picture(_rendered(spec)))
-
 
 def _rendered(spec: MovingObjectsSpec) -> sequences.RenderedSequence:
     path = sequences.HandheldPath(spec.frames)
@@ -175,31 +163,6 @@ def _lines(rows: Sequence[Row]) -> list[Mapping[str, Any]]:
         for row in finished(rows)
         for run in row["result"]["runs"]
     ]
-
-
-def _picture(sequence: sequences.RenderedSequence) -> np.ndarray:
-    """Frames with masked pixels in red, wrongly masked ones in yellow and missed ones in blue."""
-    import cv2
-
-    name, params = parse_named(MASKED, "backend")
-    system = slam.make(name, sequence.intrinsics, **params)
-    frames = list(sequence.frames)
-    run = run_sequence(system, frames, start=sequence.poses[0])
-    found, true = found_masks(run.results, sequence.intrinsics.shape), true_masks(sequence.frames)
-    assert found is not None
-    tiles = []
-    for k in np.linspace(0, len(frames) - 1, _SHOWN).astype(int):
-        image = frames[k].color.copy()
-        is_read = frames[k].depth > 0
-        for where, color in (
-            (found[k] & true[k], (255, 0, 0)),
-            (found[k] & ~true[k], (255, 220, 0)),
-            (~found[k] & true[k] & is_read, (0, 0, 255)),
-        ):
-            image[where] = image[where] // 2 + np.array(color, dtype=np.uint8) // 2
-        tiles.append(cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(255,) * 3))
-    rows = [np.hstack(tiles[k : k + _PER_ROW]) for k in range(0, _SHOWN, _PER_ROW)]
-    return np.vstack(rows)
 
 
 def true_masks(frames: RenderedFrames) -> Bool:
