@@ -93,8 +93,7 @@ class SlamBatch(Experiment, Checked):
 
     def prepare(self) -> None:
         """Refuse a GPU that does not exist."""
-        if self.device == "cuda" and not wp.is_cuda_available():
-            raise InputError("not measured on a GPU: this machine has no CUDA device")
+        check_device(self.device)
 
     @staticmethod
     def run(spec: BatchSpec) -> dict[str, Any]:
@@ -160,6 +159,12 @@ def measure(
         "ate_unaligned_m": float(np.median(errors)),
         "lost_frames": lost,
     }
+
+
+def check_device(device: str) -> None:
+    """Refuse a GPU that does not exist."""
+    if device == "cuda" and not wp.is_cuda_available():
+        raise InputError("not measured on a GPU: this machine has no CUDA device")
 
 
 def device_bytes(make: Any) -> tuple[Any, int]:

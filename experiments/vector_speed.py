@@ -13,11 +13,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from ms_slam_experiments.slam_batch import device_bytes
+from ms_slam_experiments.slam_batch import check_device, device_bytes
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env._runtime.threads import available_cores
-from ms_slam_env._runtime.warp import wp
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded, chosen
@@ -93,8 +92,7 @@ class VectorSpeed(Experiment, Checked):
 
     def prepare(self) -> None:
         """Refuse a GPU that does not exist."""
-        if self.device == "cuda" and not wp.is_cuda_available():
-            raise InputError("not measured on a GPU: this machine has no CUDA device")
+        check_device(self.device)
 
     @staticmethod
     def run(spec: VectorSpec) -> dict[str, Any]:
