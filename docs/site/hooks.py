@@ -195,7 +195,7 @@ GALLERY = """# Environments
 {own}
 
 The pictures are episodes of `nbv`, of `greedy` on the straight line, and of `random` where the SLAM
-configuration is chosen too; `python -m ms_slam_experiments.pictures.film --gallery` makes them.
+configuration is chosen too; `python -m ms_slam_docs.film --gallery` makes them.
 
 ## Tasks
 
