@@ -14,8 +14,7 @@ from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Column, Table, grouped, make_table
+from ms_slam_env.report.tables import Column, Row, Table, grouped, make_table
 from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
 from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_config import PAPER

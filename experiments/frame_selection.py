@@ -20,10 +20,10 @@ from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
-from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import (
     Column,
     Grouping,
+    Row,
     Table,
     flattened,
     grouped,

@@ -25,8 +25,7 @@ from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import SequenceRun
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, flattened, grouped, make_table, summary
+from ms_slam_env.report.tables import Row, Table, flattened, grouped, make_table, summary
 from ms_slam_env.robot import CAMERA_RADIUS_M, NUM_ROTATIONS
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.scenes import PUBLISHED_ROOMS

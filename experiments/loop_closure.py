@@ -27,8 +27,7 @@ from ms_slam_env.geometry import invert
 from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table, measured, summary
+from ms_slam_env.report.tables import Row, Table, finished, make_table, measured, summary
 from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 

@@ -21,9 +21,9 @@ from ms_slam_env.evaluation.loop_closures import pose_error
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
 from ms_slam_env.geometry import invert, make_pose, relative_angle, so3_exp, transform_points
 from ms_slam_env.report.charts import Chart, Panel, interval_series
-from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import median_interval
 from ms_slam_env.report.tables import (
+    Row,
     Table,
     Value,
     finished,

@@ -20,8 +20,7 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded, check_range, chosen, nested_options
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import ate_rmse
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table
+from ms_slam_env.report.tables import Row, Table, finished, make_table
 from ms_slam_env.sequences import handheld_trajectory, render_sequence
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 

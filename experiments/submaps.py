@@ -23,8 +23,7 @@ from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
 from ms_slam_env.evaluation.submap_errors import submap_errors, submap_measures, submap_numbers
 from ms_slam_env.geometry import invert, so3_exp
 from ms_slam_env.report.charts import Chart, Panel, interval_series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, Value, flattened, grouped, make_table, summary
+from ms_slam_env.report.tables import Row, Table, Value, flattened, grouped, make_table, summary
 from ms_slam_env.scenes import SCENES, Scene
 from ms_slam_env.slam.surfel.surfel_config import SUBMAPS
 

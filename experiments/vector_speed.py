@@ -22,8 +22,7 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.env.batched.batched_env import BatchedActiveSlam
 from ms_slam_env.errors import InputError
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Column, Table, finished, make_table
+from ms_slam_env.report.tables import Column, Row, Table, finished, make_table
 from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.tasks import env_id_of, room
 
