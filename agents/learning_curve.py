@@ -14,9 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
 from ms_slam_env.report.results import RESULTS, Results, read_results, write_result_folder
-from ms_slam_env.report.tables import Table, make_table
+from ms_slam_env.report.tables import Row, Table, make_table
 
 BEST = "best.safetensors"
 LATEST = "latest.safetensors"

@@ -15,8 +15,7 @@ from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.geometry import invert, make_pose, relative_angle, so3_exp
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table
+from ms_slam_env.report.tables import Row, Table, finished, make_table
 from ms_slam_env.sequences import HandheldPath, open_sequence
 from ms_slam_env.slam.shared.alignment_check import (
     DISPUTED,

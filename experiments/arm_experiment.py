@@ -45,8 +45,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, transform_points
 from ms_slam_env.report.charts import Chart, bars
 from ms_slam_env.report.figures import caption, new_figure, save
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Grouping, Table, finished, make_table
+from ms_slam_env.report.tables import Grouping, Row, Table, finished, make_table
 
 SCENES = ("window", "table", "wall", "carpet")
 FRAME_RATE_HZ = 30  # no motion is shorter than a frame of the fastest camera

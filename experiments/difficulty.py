@@ -25,9 +25,8 @@ from ms_slam_env.evaluation.sequence_divergence import KINDS, consecutive_diverg
 from ms_slam_env.geometry import invert, relative_angle, transform_points
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import rank_correlation
-from ms_slam_env.report.tables import Column, Table, finished, flattened, grouped, make_table
+from ms_slam_env.report.tables import Column, Row, Table, finished, flattened, grouped, make_table
 from ms_slam_env.sensor.noise import noise_config
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import Sequence as RGBDSequence

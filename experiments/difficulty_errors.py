@@ -18,9 +18,8 @@ from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import run_backend
 from ms_slam_env.evaluation.sequence_divergence import KINDS, WASSERSTEIN, consecutive_distances
-from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import rank_correlation
-from ms_slam_env.report.tables import Table, finished, flattened, make_table
+from ms_slam_env.report.tables import Row, Table, finished, flattened, make_table
 from ms_slam_env.sequences import HandheldPath, open_sequence
 from ms_slam_env.sequences import Sequence as RGBDSequence
 

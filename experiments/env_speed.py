@@ -15,8 +15,7 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.env import ActiveSlamEnv
 from ms_slam_env.env.embodiments import EMBODIMENTS
 from ms_slam_env.env.registry import OBSERVATIONS
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Column, Table, finished, make_table
+from ms_slam_env.report.tables import Column, Row, Table, finished, make_table
 
 ORDER = ("ik", "physics", "move", "mask", "render", "slam", "divergence", "coverage", "lookahead")
 """Order of the stages in the table; others follow."""

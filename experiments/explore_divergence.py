@@ -10,8 +10,7 @@ from typing import Any
 
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.report.charts import Chart, over_field, scatter
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Grouping, Table
+from ms_slam_env.report.tables import Grouping, Row, Table
 from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
 from ms_slam_env.tuning import SlamEvaluator
 from ms_slam_env.tuning.objectives import FAILURE, as_metrics

@@ -14,8 +14,7 @@ from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Column, Table, finished, make_table
+from ms_slam_env.report.tables import Column, Row, Table, grouped, make_table
 from ms_slam_env.slam.configuration import SlamConfiguration, read_configuration
 from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.surfel_config import PAPER
@@ -172,13 +171,9 @@ def _series(name: str, trials: Sequence[Row], mode: str) -> Series:
     return Series(name, x, y, mode=mode)
 
 
-def _studies(rows: Sequence[Row]) -> dict[tuple[int, str], list[Row]]:
+def _studies(rows: Sequence[Row]) -> dict[tuple[Any, ...], list[Row]]:
     """Results by rate and sampler."""
-    found: dict[tuple[int, str], list[Row]] = {}
-    for row in finished(rows):
-        key = (row["spec"]["keep_every"], row["spec"]["sampler"])
-        found.setdefault(key, []).append(row["result"])
-    return dict(sorted(found.items()))
+    return dict(sorted(grouped(rows, ("keep_every", "sampler")).items()))
 
 
 def _trials(results: Sequence[Row]) -> list[Row]:

@@ -15,9 +15,8 @@ from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import Interval, bootstrap_interval
-from ms_slam_env.report.tables import Column, Table, finished, make_table
+from ms_slam_env.report.tables import Column, Row, Table, finished, make_table
 from ms_slam_env.tuning import SlamEvaluator, make_space
 from ms_slam_env.tuning.front import hypervolume
 from ms_slam_env.tuning.objectives import FAILURE, objective_values

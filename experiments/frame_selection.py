@@ -20,8 +20,16 @@ from ms_slam_env.evaluation.map_quality import map_quality
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Column, Grouping, Table, flattened, make_table, summary
+from ms_slam_env.report.tables import (
+    Column,
+    Grouping,
+    Row,
+    Table,
+    flattened,
+    grouped,
+    make_table,
+    summary,
+)
 from ms_slam_env.slam.frame_selection import (
     FrameSelectionConfig,
     RegularConfig,
@@ -182,9 +190,8 @@ def _pairs(runs: Sequence[Row]) -> Table:
         columns += [key, Column(f"regular_{key}", key, "regular skipping")]
         columns += [Column(f"better_{key}", "better_share")] if key in _PAIRED else []
     lines = []
-    compared = [run["result"] for run in runs if run["result"]["regular"] is not None]
-    for name in dict.fromkeys(run["frame_selection"] for run in compared):
-        own = [run for run in compared if run["frame_selection"] == name]
+    compared = [run for run in runs if run["result"]["regular"] is not None]
+    for (name,), own in grouped(compared, ("frame_selection",)).items():
         regular = [run["regular"] for run in own]
         line: dict[str, Any] = {"frame_selection": name}
         for key in (*_PAIRED, "astray", "cpu_ms_mean"):
@@ -206,9 +213,8 @@ def _kind(name: str) -> str:
 def _panel(runs: Sequence[Row], key: str) -> Panel:
     """A measure over the share processed: a dot per run, a line through each kind's medians."""
     by_kind: dict[str, dict[str, list[Row]]] = {}
-    for run in (run["result"] for run in runs):
-        name = run["frame_selection"]
-        by_kind.setdefault(_kind(name), {}).setdefault(name, []).append(run)
+    for (name,), own in grouped(runs, ("frame_selection",)).items():
+        by_kind.setdefault(_kind(name), {})[name] = own
     everything = by_kind.pop("none", {})
     series = []
     for kind, groups in by_kind.items():

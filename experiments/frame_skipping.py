@@ -24,8 +24,7 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.evaluation.run_sequence import run_backend
 from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
 from ms_slam_env.report.charts import Chart, scatter
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Grouping, Table, make_table
+from ms_slam_env.report.tables import Grouping, Row, Table, make_table
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import handheld_trajectory, place_trajectory, render_sequence
 

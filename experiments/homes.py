@@ -15,8 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.config import Checked, bounded
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table
+from ms_slam_env.report.tables import Row, Table, finished, make_table
 from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.scenes.builder import Geometry
 from ms_slam_env.scenes.free_space import FreeSpace, Holding

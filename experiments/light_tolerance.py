@@ -16,8 +16,7 @@ from ms_slam_env.camera import RGBDFrame, xtion
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.sequence_divergence import consecutive_divergences
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Grouping, Table, flattened
+from ms_slam_env.report.tables import Grouping, Row, Table, flattened
 from ms_slam_env.scenes import PUBLISHED_ROOMS
 from ms_slam_env.sequences import HandheldPath, open_sequence
 

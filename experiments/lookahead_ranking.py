@@ -25,8 +25,7 @@ from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import SequenceRun
 from ms_slam_env.report.charts import Chart, Guide, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table, summary
+from ms_slam_env.report.tables import Row, Table, flattened, grouped, make_table, summary
 from ms_slam_env.robot import CAMERA_RADIUS_M, NUM_ROTATIONS
 from ms_slam_env.robot.action_primitives import decompose
 from ms_slam_env.scenes import PUBLISHED_ROOMS
@@ -194,11 +193,8 @@ class LookaheadRanking(Experiment):
 
 def by_variant(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """States of all paths by setting; settings without states are left out."""
-    found: dict[str, list[Row]] = {}
-    for row in finished(rows):
-        for state in row["result"]["predictions"]:
-            found.setdefault(state["variant"], []).append(state)
-    return {name: found[name] for name in SETTINGS if name in found}
+    found = grouped(flattened(rows, "predictions"), ("variant",))
+    return {name: found[name,] for name in SETTINGS if (name,) in found}
 
 
 def _free_motions(scene: Scene, pose: Float64, motions: Float64) -> Float64:

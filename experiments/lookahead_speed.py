@@ -20,8 +20,7 @@ from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env.env_config import EnvConfig, LookaheadConfig
 from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.errors import InputError
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table
+from ms_slam_env.report.tables import Row, Table, finished, make_table
 from ms_slam_env.robot.action_primitives import NUM_MOTIONS, decompose
 from ms_slam_env.sensor import RGBDSensor
 from ms_slam_env.sequences import handheld_trajectory

@@ -27,10 +27,7 @@ from ms_slam_env.geometry import invert
 from ms_slam_env.geometry.point_clouds import voxel_downsample
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.figures import caption, new_figure, save
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table, measured, summary
-from ms_slam_env.scenes import Scene
+from ms_slam_env.report.tables import Row, Table, finished, make_table, measured, summary
 from ms_slam_env.slam.surfel import SurfelConfig
 from ms_slam_env.slam.surfel.slam import BatchedSurfelSlam
 
@@ -74,7 +71,6 @@ class LoopSpec:
         noise: one of ``NOISES``.
         closure: variant of loop closure.
         options: parameters of SLAM.
-        picture: file for a picture of the first closure; none if empty.
     """
 
     scene: str
@@ -86,7 +82,6 @@ class LoopSpec:
     size: str
     closure: str
     options: dict[str, Any] = field(default_factory=dict)
-    picture: str = ""
 
     def name(self) -> str:
         """Name of the recording."""
@@ -108,8 +103,6 @@ class LoopClosure(Experiment):
     """Image sizes."""
     options: tuple[str, ...] = ()
     """Parameters of SLAM, as in loops.window=100."""
-    pictures: Path | None = None
-    """Folder of pictures of the maps where loops closed; none by default."""
 
     unit = "recordings"
 
@@ -126,11 +119,8 @@ class LoopClosure(Experiment):
         system.reset(truth[0])
         estimate, spent, tracked = np.empty_like(truth), [], []
         closures: list[Closure] = []
-        views: tuple[MapView, MapView] | None = None
         for k, frame in enumerate(sequence.frames):
             past = system.loops.trajectory(0)
-            is_due = bool(spec.picture) and not views and k % config.loops.interval == 0
-            before = map_view(system, k) if is_due else None
             previous = system.poses[0].copy()
             start = time.process_time()
             result = system.track(frame.color[None], frame.depth[None])[0]
@@ -142,10 +132,6 @@ class LoopClosure(Experiment):
                 unclosed = previous @ invert(truth[k - 1]) @ truth[k]
                 window = config.loops.window
                 closures.append(judge_closure(k, past, truth, unclosed, estimate[k], window))
-                if before is not None:
-                    views = (before, map_view(system, k))
-        if views:
-            save_picture(views, scene, truth[closures[0].frame], Path(spec.picture), spec.name())
         frames, bent = system.loops.trajectory(0)
         final = estimate.copy()
         final[frames] = bent
@@ -177,10 +163,9 @@ class LoopClosure(Experiment):
         options = nested_options(self.options)
         from_dict(SurfelConfig, options, "options")  # refuse invalid ones before any run
         return [
-            LoopSpec(*_parse(text), size, closure, options, shown if closure != "none" else "")
+            LoopSpec(*_parse(text), size, closure, options)
             for size in self.sizes
-            for number, text in enumerate(self.recordings)
-            for shown in (str(self.pictures / f"{number:02d}_{size}.png") if self.pictures else "",)
+            for text in self.recordings
             for closure in VARIANTS
         ]
 
@@ -249,79 +234,6 @@ def _parse(text: str) -> tuple[str, int, str, float, float, str]:
         return scene, int(seed), path, float(step_m), float(step_deg), noise
     except ValueError:
         raise InputError(f"recording {text!r}: seed and steps must be numbers") from None
-
-
-BAND_M = (0.9, 1.5)  # heights shown: walls and furniture, neither floor nor ceiling
-NEW_FRAMES = 40  # surfels younger than this belong to the new part
-CELL_M = 0.2  # size of the places compared for how many surfels of both parts they contain
-ZOOM_M = 0.1  # half the width of the lower row's detail
-_COLOURS = {"old": "#3366bb", "new": "#cc3311", "true": "#bbbbbb"}
-
-
-@dataclass(frozen=True)
-class MapView:
-    """Points (N, 3) of a map and the age (N,) in frames of each."""
-
-    points: Float64
-    age: NDArray[np.int32]
-
-
-def map_view(system: BatchedSurfelSlam, frame: int) -> MapView:
-    """All points of a map as of a frame."""
-    surfel_map = system.map
-    points = surfel_map.points(stable=False)
-    created = surfel_map.attribute("created", stable=False)
-    return MapView(points, (frame - created).astype(np.int32))
-
-
-def save_picture(
-    views: tuple[MapView, MapView], scene: Scene, T_world_camera: Float64, path: Path, title: str
-) -> Path:
-    """Draw both maps within a band of heights; the lower row enlarges a part in view."""
-    surface = _band(scene.surface_points(0.01)[0])
-    centre = _joined_part(views[0], T_world_camera)
-    figure = new_figure(2, width=5.2, height=9.0)
-    axes = figure.subplots(2, 2)
-    for column, (view, name) in enumerate(zip(views, ("before", "after"), strict=True)):
-        points, age = view.points, view.age
-        inside = _in_band(points)
-        points, age = points[inside], age[inside]
-        for row, dot in enumerate((0.3, 4.0)):
-            ax = axes[row, column]
-            ax.scatter(surface[:, 0], surface[:, 1], s=dot, c=_COLOURS["true"], linewidths=0)
-            for label, part in (("old", age > NEW_FRAMES), ("new", age <= NEW_FRAMES)):
-                ax.scatter(*points[part, :2].T, s=dot, c=_COLOURS[label], linewidths=0)
-            ax.set_aspect("equal")
-            ax.set(xlabel="x [m]", ylabel="y [m]")
-        axes[0, column].set_title(f"{name} the closure")
-        axes[1, column].set_xlim(centre[0] - ZOOM_M, centre[0] + ZOOM_M)
-        axes[1, column].set_ylim(centre[1] - ZOOM_M, centre[1] + ZOOM_M)
-    caption(
-        figure,
-        f"{title}: surfels {BAND_M[0]} to {BAND_M[1]} m above the floor; blue: old, "
-        f"red: of the last {NEW_FRAMES} frames, grey: true surface; below: enlarged",
-    )
-    return save(figure, path)
-
-
-def _in_band(points: Float64) -> NDArray[np.bool_]:
-    return (points[:, 2] > BAND_M[0]) & (points[:, 2] < BAND_M[1])
-
-
-def _band(points: Float64) -> Float64:
-    return points[_in_band(points)]
-
-
-def _joined_part(view: MapView, pose: Float64) -> Float64:
-    """Centre (2,) of the place in view with the most old and new surfels together."""
-    camera = (view.points - pose[:3, 3]) @ pose[:3, :3]
-    u, v = camera[:, 0] / camera[:, 2], camera[:, 1] / camera[:, 2]
-    seen = (camera[:, 2] > 0.3) & (np.abs(u) < 0.5) & (np.abs(v) < 0.4) & _in_band(view.points)
-    places = view.points[seen, :2]
-    names, index = np.unique(np.floor(places / CELL_M), axis=0, return_inverse=True)
-    is_new = view.age[seen] <= NEW_FRAMES
-    counts = [np.bincount(index.ravel()[part], minlength=len(names)) for part in (is_new, ~is_new)]
-    return np.median(places[index.ravel() == np.minimum(*counts).argmax()], axis=0)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -17,7 +17,15 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import run_sequence
 from ms_slam_env.report.charts import Chart, scatter
 from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table, summary
+from ms_slam_env.report.tables import (
+    Grouping,
+    Table,
+    finished,
+    flattened,
+    grouped,
+    make_table,
+    measured,
+)
 from ms_slam_env.slam.slam_backend import TrackResult
 
 if TYPE_CHECKING:
@@ -40,7 +48,6 @@ KEYS = (
 )
 MOVING, STILL = "moving", "still"
 _WARM_UP = 5  # frames left out of the timing
-_SHOWN, _PER_ROW = 12, 6  # frames of the picture
 
 
 @dataclass(frozen=True)
@@ -115,46 +122,25 @@ class MovingObjectsExperiment(Experiment, Checked):
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """Medians with and without motion, then every run."""
-        lines = _lines(rows)
-        keys = [key for key in KEYS if any(key in line for line in lines)]
-        medians = []
-        for setting in (MOVING, STILL):
-            for backend in dict.fromkeys(line["backend"] for line in lines):
-                own = [x for x in lines if (x["setting"], x["backend"]) == (setting, backend)]
-                if own:
-                    cells = {key: summary(own, key) for key in keys if any(key in x for x in own)}
-                    worst = max(line["ate_m"] for line in own)
-                    medians.append(
-                        {"setting": setting, "backend": backend, **cells, "worst_ate_m": worst}
-                    )
-        columns = ("setting", "backend", *keys[:2], "worst_ate_m", *keys[3:])
+        runs = _runs(rows)
+        keys, by = measured(KEYS, runs), ("setting", "backend")
+        in_order = sorted(runs, key=lambda run: str(run["spec"]["setting"]))
+        medians = Grouping(by, keys).table(in_order).rows
+        worst = [max(run["ate_m"] for run in own) for own in grouped(in_order, by).values()]
+        lines = [{**line, "worst_ate_m": m} for line, m in zip(medians, worst, strict=True)]
+        every = [{**run["spec"], **run["result"]} for run in runs]
         note = "Medians over the sequences with 95 % intervals, and the largest ATE of one."
         return [
-            make_table(columns, medians, note=note),
-            make_table(("sequence", "backend", "moving_share", *keys), lines, "Every run"),
+            make_table((*by, *keys[:2], "worst_ate_m", *keys[3:]), lines, note=note),
+            make_table(("sequence", "backend", "moving_share", *keys), every, "Every run"),
         ]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
         """Error against processor time, a mark for each sequence with moving objects."""
-        points = [
-            cast(Row, {"spec": {"backend": line["backend"]}, "result": line, "error": None})
-            for line in _lines(rows)
-            if line["setting"] == MOVING
-        ]
-        panel = scatter(points, "cpu_ms_median", "ate_m", "backend", log="xy")
+        moving = [run for run in _runs(rows) if run["spec"]["setting"] == MOVING]
+        panel = scatter(moving, "cpu_ms_median", "ate_m", "backend", log="xy")
         caption = "One mark a sequence in which something moves."
         return [Chart("moving_objects", "Error against time", caption, [panel])]
-
-    def write_pictures(self, rows: Sequence[Row], out: Path) -> None:
-        """The mask on frames of the sequence with the most motion."""
-        from ms_slam_experiments.pictures.stills import save_image
-
-        moving = [row for row in finished(rows) if row["result"]["moving_share"] > 0]
-        if not moving or MASKED not in self.backends:
-            return
-        most = max(moving, key=lambda row: row["result"]["moving_share"])["spec"]["sequence"]
-        spec = MovingObjectsSpec(most, (), self.image_size, self.frames)
-        save_image(out / "mask.png", _picture(_rendered(spec)))
 
 
 def _rendered(spec: MovingObjectsSpec) -> sequences.RenderedSequence:
@@ -163,43 +149,16 @@ def _rendered(spec: MovingObjectsSpec) -> sequences.RenderedSequence:
     return cast(sequences.RenderedSequence, sequence)
 
 
-def _lines(rows: Sequence[Row]) -> list[Mapping[str, Any]]:
-    """A line for each run."""
-    return [
-        {
-            "sequence": row["spec"]["sequence"],
-            "setting": MOVING if row["result"]["moving_share"] > 0 else STILL,
-            "moving_share": row["result"]["moving_share"],
-            **run,
-        }
-        for row in finished(rows)
-        for run in row["result"]["runs"]
-    ]
-
-
-def _picture(sequence: sequences.RenderedSequence) -> np.ndarray:
-    """Frames with masked pixels in red, wrongly masked ones in yellow and missed ones in blue."""
-    import cv2
-
-    name, params = parse_named(MASKED, "backend")
-    system = slam.make(name, sequence.intrinsics, **params)
-    frames = list(sequence.frames)
-    run = run_sequence(system, frames, start=sequence.poses[0])
-    found, true = found_masks(run.results, sequence.intrinsics.shape), true_masks(sequence.frames)
-    assert found is not None
-    tiles = []
-    for k in np.linspace(0, len(frames) - 1, _SHOWN).astype(int):
-        image = frames[k].color.copy()
-        is_read = frames[k].depth > 0
-        for where, color in (
-            (found[k] & true[k], (255, 0, 0)),
-            (found[k] & ~true[k], (255, 220, 0)),
-            (~found[k] & true[k] & is_read, (0, 0, 255)),
-        ):
-            image[where] = image[where] // 2 + np.array(color, dtype=np.uint8) // 2
-        tiles.append(cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(255,) * 3))
-    rows = [np.hstack(tiles[k : k + _PER_ROW]) for k in range(0, _SHOWN, _PER_ROW)]
-    return np.vstack(rows)
+def _runs(rows: Sequence[Row]) -> list[Row]:
+    """A row for each run, which says whether something moves."""
+    found: list[Row] = []
+    for row in finished(rows):
+        share = row["result"]["moving_share"]
+        setting = {"setting": MOVING if share > 0 else STILL}
+        for run in flattened([row], "runs"):
+            result = {"moving_share": share, **run["result"]}
+            found.append({**run, "spec": {**run["spec"], **setting}, "result": result})
+    return found
 
 
 def true_masks(frames: RenderedFrames) -> Bool:

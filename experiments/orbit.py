@@ -16,8 +16,7 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import run_backend
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Grouping, Table, finished, make_table
+from ms_slam_env.report.tables import Grouping, Row, Table, finished, make_table
 
 METRICS = (
     *("relocalisation_found_s", "relocalisations", "never_relocalised", "robustness"),

@@ -16,8 +16,7 @@ from ms_slam_env._runtime.threads import limit_threads
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.config import Checked, bounded, parse_named
 from ms_slam_env.evaluation.run_sequence import run_sequence
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, Value, finished, make_table, summary
+from ms_slam_env.report.tables import Row, Table, Value, finished, make_table, summary
 
 COLUMNS = ("sequence", "image_size", "attempts_count", "found", "wrong", "frames_to_pose")
 

@@ -22,8 +22,7 @@ from ms_slam_env.config import Checked, bounded
 from ms_slam_env.geometry import invert, se3_log
 from ms_slam_env.metrics.consistency import COVERAGES
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, format_number, make_table
+from ms_slam_env.report.tables import Row, Table, finished, format_number, make_table
 
 WARM_UP = 5  # frames before the first error, so that there is a map
 COUNTS = ("frames", "degenerate_frames", "lost_frames")

@@ -21,9 +21,18 @@ from ms_slam_env.evaluation.loop_closures import pose_error
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
 from ms_slam_env.geometry import invert, make_pose, relative_angle, so3_exp, transform_points
 from ms_slam_env.report.charts import Chart, Panel, interval_series
-from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import median_interval
-from ms_slam_env.report.tables import Table, Value, finished, format_value, make_table, summary
+from ms_slam_env.report.tables import (
+    Row,
+    Table,
+    Value,
+    finished,
+    flattened,
+    format_value,
+    grouped,
+    make_table,
+    summary,
+)
 from ms_slam_env.scenes import PUBLISHED_ROOMS, Scene
 from ms_slam_env.slam import SlamBackend
 
@@ -329,15 +338,11 @@ class Relocalization(Experiment, Checked):
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """One line for each image size, setting and variant, and all settings together."""
-        cells: dict[tuple[str, str, str], list[Row]] = {}
-        together: dict[tuple[str, str, str], list[Row]] = {}
-        for row in finished(rows):
-            for attempt in row["result"]["attempts"]:
-                size, variant = row["spec"]["size"], attempt["variant"]
-                cells.setdefault((size, attempt["setting"], variant), []).append(attempt)
-                together.setdefault((size, EVERY, variant), []).append(attempt)
+        attempts = flattened(rows, "attempts")
+        cells = grouped(attempts, ("size", "setting", "variant"))
         if len({setting for _, setting, _ in cells}) > 1:
-            cells |= together
+            together = grouped(attempts, ("size", "variant"))
+            cells |= {(size, EVERY, variant): own for (size, variant), own in together.items()}
         sizes, settings = ([*dict.fromkeys(key[part] for key in cells)] for part in (0, 1))
         order = sorted(cells, key=lambda key: (sizes.index(key[0]), settings.index(key[1])))
         lines = [_line(key, cells[key]) for key in order]
@@ -357,7 +362,7 @@ class Relocalization(Experiment, Checked):
         return [Chart("relocalization", "Poses found", caption, [Panel("", "found", series)])]
 
 
-def _line(key: tuple[str, str, str], attempts: list[Row]) -> dict[str, Value]:
+def _line(key: tuple[Any, ...], attempts: list[Row]) -> dict[str, Value]:
     findable = [attempt for attempt in attempts if attempt["setting"] != FOREIGN]
     given = [attempt for attempt in attempts if math.isfinite(attempt["relocalisation_s"])]
     seconds = [attempt["relocalisation_s"] for attempt in given]

@@ -19,8 +19,7 @@ from ms_slam_env.config import Checked, bounded, parse_named
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.consistency import COVERAGES
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, grouped, make_table, summary
+from ms_slam_env.report.tables import Row, Table, finished, grouped, make_table, summary
 from ms_slam_env.sequences import check_sequence
 from ms_slam_env.sequences.sequence import Frames
 from ms_slam_env.sequences.sequence import Sequence as Recording

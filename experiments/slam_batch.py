@@ -20,8 +20,7 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded, check_range, chosen, nested_options
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import ate_rmse
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table
+from ms_slam_env.report.tables import Row, Table, finished, make_table
 from ms_slam_env.sequences import handheld_trajectory, render_sequence
 from ms_slam_env.slam.surfel import BatchedSurfelSlam, SurfelConfig
 
@@ -93,8 +92,7 @@ class SlamBatch(Experiment, Checked):
 
     def prepare(self) -> None:
         """Refuse a GPU that does not exist."""
-        if self.device == "cuda" and not wp.is_cuda_available():
-            raise InputError("not measured on a GPU: this machine has no CUDA device")
+        check_device(self.device)
 
     @staticmethod
     def run(spec: BatchSpec) -> dict[str, Any]:
@@ -160,6 +158,12 @@ def measure(
         "ate_unaligned_m": float(np.median(errors)),
         "lost_frames": lost,
     }
+
+
+def check_device(device: str) -> None:
+    """Refuse a GPU that does not exist."""
+    if device == "cuda" and not wp.is_cuda_available():
+        raise InputError("not measured on a GPU: this machine has no CUDA device")
 
 
 def device_bytes(make: Any) -> tuple[Any, int]:

@@ -24,8 +24,7 @@ from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded, check_range, parse_named
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Column, Table, finished, make_table
+from ms_slam_env.report.tables import Column, Row, Table, finished, make_table
 
 THIS, OTHER = "this", "other"
 REST = "rest"

@@ -13,8 +13,7 @@ from ms_slam_env import ENV_IDS, PERTURBED_ENV_IDS, TASK_IDS
 from ms_slam_env.benchmark.experiment import Experiment, check_each
 from ms_slam_env.config import Checked, bounded
 from ms_slam_env.metrics.cost.meter import resident_mb
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table
+from ms_slam_env.report.tables import Row, Table, finished, make_table
 
 IDS = (*ENV_IDS, *TASK_IDS, *PERTURBED_ENV_IDS)
 

@@ -8,8 +8,7 @@ from typing import Any
 
 from ms_slam_env.benchmark.episodes import DEFAULT_PLANNERS, EpisodeExperiment, short_planner_names
 from ms_slam_env.report.charts import Chart, over_field
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Grouping, Table
+from ms_slam_env.report.tables import Grouping, Row, Table
 
 METRICS = ("lost", "ate_m", "ate_tracked_m", "tracked_share", "f_score_5cm", "rcm")
 _PANELS = ("lost", "ate_m", "f_score_5cm", "rcm")

@@ -23,8 +23,7 @@ from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
 from ms_slam_env.evaluation.submap_errors import submap_errors, submap_measures, submap_numbers
 from ms_slam_env.geometry import invert, so3_exp
 from ms_slam_env.report.charts import Chart, Panel, interval_series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, Value, finished, make_table, summary
+from ms_slam_env.report.tables import Row, Table, Value, flattened, grouped, make_table, summary
 from ms_slam_env.scenes import SCENES, Scene
 from ms_slam_env.slam.surfel.surfel_config import SUBMAPS
 
@@ -122,12 +121,9 @@ class SubmapsExperiment(Experiment, Checked):
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """One line for each setting and variant."""
-        cells: dict[tuple[str, str], list[Row]] = {}
-        for row in finished(rows):
-            for attempt in row["result"]["attempts"]:
-                cells.setdefault((attempt["setting"], attempt["variant"]), []).append(attempt)
+        cells = grouped(flattened(rows, "attempts"), ("setting", "variant"))
         note = "Means of counts and shares, medians of the rest, with 95 % intervals."
-        return [make_table(COLUMNS, [_line(key, cells[key]) for key in cells], note=note)]
+        return [make_table(COLUMNS, [_line(*cell) for cell in cells.items()], note=note)]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
         """Error of the final poses by setting."""
@@ -219,7 +215,7 @@ def _measure(run: SequenceRun, one: Interruption, mapped: int, drift: Float64) -
     }
 
 
-def _line(key: tuple[str, str], attempts: list[Row]) -> dict[str, Value]:
+def _line(key: tuple[Any, ...], attempts: list[Row]) -> dict[str, Value]:
     setting, variant = key
     errors = [error for attempt in attempts for error in attempt.get("link_error_m", ())]
     found = [a for a in attempts if math.isfinite(a.get("frames_to_join", math.inf))]

@@ -25,8 +25,7 @@ from ms_slam_env.env.coverage import team_share
 from ms_slam_env.env.planners import Planner, Recovering, check_planner, make_planner
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Grouping, Table, finished, make_table
+from ms_slam_env.report.tables import Grouping, Row, Table, finished, make_table
 from ms_slam_env.scenes import HOMES, Scene
 from ms_slam_env.tasks import find_task
 

@@ -13,18 +13,16 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from ms_slam_experiments.slam_batch import device_bytes
+from ms_slam_experiments.slam_batch import check_device, device_bytes
 
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env._runtime.threads import available_cores
-from ms_slam_env._runtime.warp import wp
 from ms_slam_env.benchmark.experiment import Experiment
 from ms_slam_env.camera import xtion
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.env.batched.batched_env import BatchedActiveSlam
 from ms_slam_env.errors import InputError
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Column, Table, finished, make_table
+from ms_slam_env.report.tables import Column, Row, Table, finished, make_table
 from ms_slam_env.scenes import SEED_SPLITS
 from ms_slam_env.tasks import env_id_of, room
 
@@ -93,8 +91,7 @@ class VectorSpeed(Experiment, Checked):
 
     def prepare(self) -> None:
         """Refuse a GPU that does not exist."""
-        if self.device == "cuda" and not wp.is_cuda_available():
-            raise InputError("not measured on a GPU: this machine has no CUDA device")
+        check_device(self.device)
 
     @staticmethod
     def run(spec: VectorSpec) -> dict[str, Any]:

@@ -27,6 +27,7 @@ ABOVE_ALL = {"gym_ids", ""}  # "" is ms_slam_env/__init__.py
 NEVER = {
     *("baselines", "agents", "experiments", "evo"),
     *("ms_slam_baselines", "ms_slam_agents", "ms_slam_experiments"),
+    "ms_slam_docs",
 }
 ONLY_INSIDE_FUNCTIONS = {
     "kiss_icp",

@@ -30,7 +30,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     out = tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         (source / name).write_bytes((ROOT / name).read_bytes())
-    for folder in ("ms_slam_env", "agents", "baselines", "experiments"):
+    for folder in ("ms_slam_env", "agents", "baselines", "experiments", "docs/site"):
         for path in (ROOT / folder).rglob("*"):
             if path.suffix in (".py", ".typed"):
                 target = source / path.relative_to(ROOT)

@@ -195,7 +195,7 @@ GALLERY = """# Environments
 {own}
 
 The pictures are episodes of `nbv`, of `greedy` on the straight line, and of `random` where the SLAM
-configuration is chosen too; `python -m ms_slam_experiments.pictures.film --gallery` makes them.
+configuration is chosen too; `python -m ms_slam_docs.film --gallery` makes them.
 
 ## Tasks
 
@@ -266,7 +266,7 @@ def _perturbed() -> Iterator[str]:
 
 def _summary(thing: Any) -> str:
     """First paragraph of a docstring, its roles as code."""
-    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", inspect.getdoc(thing).split("\n\n")[0])
+    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", (inspect.getdoc(thing) or "").split("\n\n")[0])
     return text.replace("``", "`").replace("\n", " ")
 
 
@@ -313,5 +313,5 @@ def _observations(num_motions: int, num_configurations: int) -> str:
         parts = space.spaces if isinstance(space, Dict) else {"": space}
         for part, box in parts.items():
             shown = f"`{part}`" if part else "the vector"
-            rows.append((f"`{name}`", shown, str(tuple(box.shape)), str(box.dtype)))
+            rows.append((f"`{name}`", shown, str(tuple(box.shape or ())), str(box.dtype)))
     return _table(["`observation=`", "part", "shape", "type"], rows)

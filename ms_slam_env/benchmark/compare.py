@@ -34,8 +34,7 @@ from ms_slam_env.evaluation.seen_surface import open_with_surface
 from ms_slam_env.evaluation.trajectory_files import tracked_beside
 from ms_slam_env.geometry import invert
 from ms_slam_env.report.charts import Chart, scatter
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished
+from ms_slam_env.report.tables import Row, Table, finished
 from ms_slam_env.scenes import PUBLISHED_ROOMS
 from ms_slam_env.sequences import HandheldPath, associate, read_trajectory
 from ms_slam_env.sequences import Sequence as RGBDSequence

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from ms_slam_env.metrics.registry import metric
-from ms_slam_env.report.records import Row
 from ms_slam_env.report.statistics import median_interval, share_interval
-from ms_slam_env.report.tables import Column, Table, finished, make_table, summary
+from ms_slam_env.report.tables import Column, Row, Table, finished, make_table, summary
 
 METRICS = (
     *("ate_m", "ate_tracked_m", "tracked_share", "ate_max_m", "ate_unaligned_m"),

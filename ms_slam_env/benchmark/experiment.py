@@ -10,7 +10,6 @@ import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
-from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from ms_slam_env._runtime.extension import ExtensionPoint
@@ -74,9 +73,6 @@ class Experiment(ABC):
     def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
         """Return further entries of ``results.json``; none by default."""
         return {}
-
-    def write_pictures(self, rows: Sequence[Row], out: Path) -> None:  # noqa: B027
-        """Write pictures that are not charts into folder ``out``; none by default."""
 
     def spec(self, kind: type[S], **own: Any) -> S:
         """Make one spec from the fields ``own`` and, for the others, options of the same name."""
@@ -166,6 +162,8 @@ def _paragraphs(cls: type) -> list[str]:
     return [" ".join(part.split()) for part in text.strip().split("\n\n")]
 
 
+IN_A_CLONE = "clone the project and pip install -e ."
+"""How to get what a wheel leaves out."""
 _RESEARCH = importlib.util.find_spec("ms_slam_experiments")
 HAS_RESEARCH = _RESEARCH is not None
 """Whether this is a checkout, which also has the project's research experiments."""

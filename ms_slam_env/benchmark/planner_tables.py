@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from ms_slam_env.benchmark.episodes import short_planner_names
 from ms_slam_env.env.planners import is_privileged
 from ms_slam_env.report import statistics
-from ms_slam_env.report.leaders import PAIRS, PRIVILEGED
 from ms_slam_env.report.tables import (
     Column,
     Row,
@@ -25,6 +24,14 @@ from ms_slam_env.report.tables import (
     make_table,
 )
 
+PAIRS = {
+    "f_score_5cm": "Share of pairs, by final F-score",
+    "f_score_5cm_area": "Share of pairs, by area under the F-score",
+    "return": "Share of pairs, by return",
+}
+"""Metrics that planners are compared by, and the titles of the tables of every two planners."""
+PRIVILEGED = "privileged"
+"""Column of whether a planner sees the truth."""
 RANKED_BY = "f_score_5cm"
 """A camera that stands still loses recall, one that gets lost loses precision."""
 HEADLINE = (

@@ -34,8 +34,7 @@ from ms_slam_env.benchmark.planner_tables import (
 )
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.charts import Chart, by_group, quartile_band, quartile_bands, scatter
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Grouping, Table, complete_cases, finished
+from ms_slam_env.report.tables import Grouping, Row, Table, complete_cases, finished
 from ms_slam_env.tasks import OWN, find_task
 
 ALL = "all"

@@ -254,7 +254,6 @@ def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results
     return write_result_folder(
         out,
         RESULTS,
-        lambda folder: experiment.write_pictures(rows, folder),
         kind=_kind(experiment),
         title=experiment.title(),
         about=experiment.about(),

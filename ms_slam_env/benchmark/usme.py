@@ -24,8 +24,7 @@ from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
 from ms_slam_env.evaluation.trajectory_charts import thinned
 from ms_slam_env.geometry import transform_points
 from ms_slam_env.report.charts import Chart, Panel, Series
-from ms_slam_env.report.records import Row
-from ms_slam_env.report.tables import Table, finished, make_table, measured
+from ms_slam_env.report.tables import Row, Table, finished, make_table, measured
 from ms_slam_env.scenes import Scene
 from ms_slam_env.sequences.usme_suite import NAMES, SUITE, UsmeSequence, find, made_with, render
 

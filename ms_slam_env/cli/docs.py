@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import tyro
@@ -39,8 +41,8 @@ class Arguments:
 def main(arguments: Sequence[str]) -> int:
     """Write the tables, or check them, and print the pages that were out of date."""
     args = parse(Arguments, arguments, "ms-slam docs")
+    from ms_slam_env.benchmark.experiment import IN_A_CLONE
     from ms_slam_env.benchmark.planner_tables import with_privilege
-    from ms_slam_env.report.markdown_pages import update_pages
     from ms_slam_env.report.results import pack_results
 
     if args.pack:
@@ -50,8 +52,11 @@ def main(arguments: Sequence[str]) -> int:
     pages = args.pages or pages_of(args.root)
     if not pages:
         raise InputError(f"{args.root} holds no pages: no {_PAGES[0]} and no Markdown in docs")
+    if find_spec("ms_slam_docs") is None:
+        raise InputError(f"what writes pages is not installed: {IN_A_CLONE}")
     results = args.root / "docs" / "results"
-    changed = update_pages(pages, results, not args.check, with_privilege)
+    update = import_module("ms_slam_docs.markdown_pages").update_pages
+    changed = update(pages, results, not args.check, with_privilege)
     for page in changed:
         print(f"{page}: {'out of date' if args.check else 'written'}")
     if args.check and changed:

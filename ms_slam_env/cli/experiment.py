@@ -19,9 +19,10 @@ from ms_slam_env.benchmark import (
     run_experiment,
 )
 from ms_slam_env.benchmark.checking import check_results, committed_results
+from ms_slam_env.benchmark.experiment import IN_A_CLONE
 from ms_slam_env.report.results import RESULTS, read_results
 
-ELSEWHERE = "the research of the project is not installed: clone it and pip install -e ."
+ELSEWHERE = f"the research of the project is not installed: {IN_A_CLONE}"
 
 
 def main(arguments: Sequence[str]) -> int:

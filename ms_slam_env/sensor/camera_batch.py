@@ -1,8 +1,8 @@
 # mypy: disable-error-code="attr-defined"
 """Many cameras, each in a scene of its own, whose images stay on the device.
 
-The kernels are those of one scene (``rays``, ``embree``, ``shading``, ``depth_noise``), but look up
-each image's scene in a table, so that one launch renders all of them.
+The kernels that shade and measure are those of one scene; they look up each image's scene in a
+table, as those here that cast rays, so that one launch renders all of them.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from ms_slam_env.camera import Intrinsics
 from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor.casters import EmbreeRayCaster, WarpRayCaster
 from ms_slam_env.sensor.depth_noise import (
-    DepthNoise,
     make_depth_noise,
-    measure_span,
+    measure_depth,
     projector_shadow,
 )
 from ms_slam_env.sensor.embree import TILE_HEIGHT, TILE_WIDTH, cast_tile, embree_library
@@ -31,26 +30,24 @@ from ms_slam_env.sensor.native import VECTOR_FLAGS, frame_keys, span_of
 from ms_slam_env.sensor.noise import NoiseConfig
 from ms_slam_env.sensor.rays import Hits, Pinhole, cast_ray, make_hits, make_pinhole
 from ms_slam_env.sensor.rgbd import RGBDSensor
-from ms_slam_env.sensor.shading import Surfaces, Tables, shade_span
+from ms_slam_env.sensor.shading import Surfaces, shade
 
 wp.set_module_options(VECTOR_FLAGS)
 
 
 @wp.struct
-class RenderedScene:
-    """What rendering needs of a scene."""
+class CastScene:
+    """What casting rays needs of a scene."""
 
     mesh: wp.uint64  # Warp's mesh, or the address of Embree's scene
     intersect: wp.uint64  # address of rtcIntersect8, for Embree alone
     vertices: wp.array[wp.vec3]  # (V,) for Embree alone
     faces: wp.array[wp.vec3i]  # (F,) for Embree alone
-    surfaces: Surfaces
-    exposure: wp.float32
 
 
 @wp.kernel
 def _cast_rays(
-    scenes: wp.array[RenderedScene],  # (B,)
+    scenes: wp.array[CastScene],  # (B,)
     T_world_camera: wp.array[wp.mat44],  # (B,)
     camera: Pinhole,
     hits: Hits,  # of B * H * W rays
@@ -61,7 +58,7 @@ def _cast_rays(
 
 @wp.kernel
 def _cast_tiles(
-    scenes: wp.array[RenderedScene],  # (B,)
+    scenes: wp.array[CastScene],  # (B,)
     T_world_camera: wp.array[wp.mat44],  # (B,)
     camera: Pinhole,
     hits: Hits,  # of B * H * W rays
@@ -79,79 +76,6 @@ def _cast_tiles(
         y,
         x,
         hits,
-    )
-
-
-@wp.kernel
-def _shade(
-    scenes: wp.array[RenderedScene],  # (B,)
-    T_world_camera: wp.array[wp.mat44],  # (B,)
-    camera: Pinhole,
-    span: int,
-    hits: Hits,  # of B * H * W rays
-    shot: float,
-    read: float,
-    keys: wp.array2d[wp.uint32],  # (B, 2)
-    tables: Tables,
-    color: wp.array2d[wp.uint8],  # (B * H * W, 3)
-) -> None:
-    b, y, part = wp.tid()
-    scene = scenes[b]
-    first = b * camera.height * camera.width
-    x = part * span
-    count = wp.min(span, camera.width - x)
-    shade_span(
-        T_world_camera[b],
-        camera,
-        first,
-        y,
-        x,
-        count,
-        hits,
-        scene.surfaces,
-        scene.exposure,
-        shot,
-        read,
-        keys[b, 0],
-        keys[b, 1],
-        tables,
-        color,
-    )
-
-
-@wp.kernel
-def _measure_depth(
-    scenes: wp.array[RenderedScene],  # (B,)
-    T_world_camera: wp.array[wp.mat44],  # (B,)
-    camera: Pinhole,
-    span: int,
-    hits: Hits,  # of B * H * W rays
-    shadow: wp.array[wp.uint8],  # (B * H * W,)
-    noise: DepthNoise,
-    keys: wp.array2d[wp.uint32],  # (B, 2)
-    normals: wp.array[wp.float32],  # quantiles of N(0, 1)
-    depth: wp.array[wp.float32],  # (B * H * W,)
-) -> None:
-    b, y, part = wp.tid()
-    scene = scenes[b]
-    x = part * span
-    measure_span(
-        T_world_camera[b],
-        camera,
-        b * camera.height * camera.width,
-        y,
-        x,
-        wp.min(span, camera.width - x),
-        hits.t,
-        hits.face,
-        scene.surfaces.normal,
-        scene.surfaces.plane,
-        shadow,
-        noise,
-        keys[b, 0],
-        keys[b, 1],
-        normals,
-        depth,
     )
 
 
@@ -181,7 +105,9 @@ class CameraBatch:
         self.intrinsics, self.device = intrinsics, device
         self._uses_embree = packets and device == "cpu" and embree_library() is not None
         self._casters: WeakKeyDictionary[Scene, WarpRayCaster] = WeakKeyDictionary()
-        self._scenes = StructTable(batch, RenderedScene, device)
+        self._scenes = StructTable(batch, CastScene, device)
+        self._surfaces = StructTable(batch, Surfaces, device)
+        self._exposures = HostDeviceBuffer(batch, wp.float32, device)
         height, width = intrinsics.shape
         shape, count = (batch, height, width), batch * height * width
         camera, span = make_pinhole(intrinsics, device=device), span_of(width, device)
@@ -194,24 +120,28 @@ class CameraBatch:
         depth = wp.zeros(count, dtype=wp.float32, device=device)
         self.color, self.depth = color.reshape((*shape, 3)), depth.reshape(shape)
         tables, depth_noise = upload_tables(device), make_depth_noise(noise, intrinsics)
-        seen = [self._scenes.array, self._poses.array, camera]
+        seen, surfaces = [self._poses.array, camera], self._surfaces.array
         stages: list[tuple[Any, Any, list[Any]]] = []
         tiles = batch, -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)
         cast = (_cast_tiles, tiles) if self._uses_embree else (_cast_rays, shape)
-        stages.append((*cast, [*seen, hits]))
-        shading = [span, hits, noise.shot, noise.read, self._keys.array, tables, color]
-        stages.append((_shade, parts, [*seen, *shading]))
+        stages.append((*cast, [self._scenes.array, *seen, hits]))
+        lit = [span, hits, surfaces, self._exposures.array]
+        shading = [noise.shot, noise.read, self._keys.array, tables, color]
+        stages.append((shade, parts, [*seen, *lit, *shading]))
         if noise.shadow:
             inputs = [hits.t, hits.face, width, depth_noise, shadow]
             stages.append((projector_shadow, batch * height, inputs))
-        measuring = [span, hits, shadow, depth_noise, self._keys.array, tables.normals, depth]
-        stages.append((_measure_depth, parts, [*seen, *measuring]))
+        measuring = [span, hits.t, hits.face, surfaces, shadow, depth_noise, self._keys.array]
+        stages.append((measure_depth, parts, [*seen, *measuring, tables.normals, depth]))
         self._stages = [RecordedLaunch(*stage, device) for stage in stages]
 
     def enter(self, camera: int, sensor: RGBDSensor) -> None:
         """Put a camera into the scene of ``sensor``, which is on the same device."""
-        seen = RenderedScene()
-        seen.surfaces, seen.exposure = sensor.surfaces, sensor.scene.exposure
+        self._surfaces.put(camera, sensor.surfaces, sensor)
+        exposures = self._exposures.read()
+        exposures[camera] = sensor.scene.exposure
+        self._exposures.write(exposures)
+        seen = CastScene()
         caster = sensor.caster
         if self._uses_embree:
             assert isinstance(caster, EmbreeRayCaster)

@@ -76,22 +76,22 @@ class ChangingView:
             at += len(body.mesh.faces)
         self.surfaces = _copy(surfaces)
         self.surfaces.irradiance = wp.clone(surfaces.irradiance)
-        self.posed_face, self.normal, self.plane = hits.face, surfaces.normal, surfaces.plane
+        self.posed_face, self.posed = hits.face, self.surfaces
         if bodies:
             self.surfaces.normal = wp.clone(surfaces.normal)
             self.surfaces.plane = wp.clone(surfaces.plane)
-            self.normal, self.plane = self.surfaces.normal, self.surfaces.plane
             if poses > 1:
                 more = poses * self._moving_faces
                 self.posed_face = wp.zeros_like(hits.face)
-                self.normal = wp.zeros(first + more, dtype=wp.vec3, device=device)
-                self.plane = wp.zeros(first + more, dtype=wp.float32, device=device)
-                wp.copy(self.normal, surfaces.normal, count=first)
-                wp.copy(self.plane, surfaces.plane, count=first)
+                self.posed = _copy(self.surfaces)
+                self.posed.normal = wp.zeros(first + more, dtype=wp.vec3, device=device)
+                self.posed.plane = wp.zeros(first + more, dtype=wp.float32, device=device)
+                wp.copy(self.posed.normal, surfaces.normal, count=first)
+                wp.copy(self.posed.plane, surfaces.plane, count=first)
             middle = slice(poses // 2, poses // 2 + 1)
             self._planes = [(self._rows(self.surfaces.normal, self.surfaces.plane), middle)]
             if poses > 1:
-                self._planes.append((self._rows(self.normal, self.plane), slice(None)))
+                self._planes.append((self._rows(self.posed.normal, self.posed.plane), slice(None)))
             (self._light_of_bodies,) = self._rows(self.surfaces.irradiance)
         self.exposure_factor = 1.0
         self._lit: NDArray[np.int64] = np.zeros(0, dtype=np.int64)

@@ -10,6 +10,7 @@ from ms_slam_env.native import native_source
 from ms_slam_env.sensor.native import VECTOR_FLAGS
 from ms_slam_env.sensor.noise import NATIVE_WIDTH, NoiseConfig
 from ms_slam_env.sensor.rays import Pinhole, pose_of_row
+from ms_slam_env.sensor.shading import Surfaces
 
 _MAX_LATERAL_ANGLE = math.radians(80.0)  # the published fit ends there
 _AXIAL_KNEE = math.radians(60.0)
@@ -115,8 +116,7 @@ def measure_depth(
     span: int,
     hit_t: wp.array[wp.float32],  # (B * H * W,)
     hit_face: wp.array[wp.int32],
-    face_normal: wp.array[wp.vec3],  # (F,)
-    face_plane: wp.array[wp.float32],  # (F,)
+    surfaces: wp.array[Surfaces],  # (B,) of each image's scene; (1,) of all
     shadow: wp.array[wp.uint8],  # (B * H * W,)
     noise: DepthNoise,
     keys: wp.array2d[wp.uint32],  # (B, 2)
@@ -125,6 +125,7 @@ def measure_depth(
 ) -> None:
     """Jitter, dropouts, range, axial noise, quantisation; one thread for ``span`` pixels."""
     b, y, part = wp.tid()
+    scene = surfaces[wp.min(b, surfaces.shape[0] - 1)]
     x = part * span
     measure_span(
         T_world_camera[pose_of_row(camera, b, y)],
@@ -135,8 +136,8 @@ def measure_depth(
         wp.min(span, camera.width - x),
         hit_t,
         hit_face,
-        face_normal,
-        face_plane,
+        scene.normal,
+        scene.plane,
         shadow,
         noise,
         keys[b, 0],

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import HostDeviceBuffer, RecordedLaunch, wp
+from ms_slam_env._runtime.warp import HostDeviceBuffer, RecordedLaunch, StructTable, wp
 from ms_slam_env.scenes.scene import TexturedMesh
 from ms_slam_env.sensor.bodies import Body
 from ms_slam_env.sensor.casters import RayCaster
@@ -107,8 +107,10 @@ class Images:
         self._depth = HostDeviceBuffer(count, wp.float32, device)
         self._cast = caster.bind(self._poses.array, camera, hits, shape)
         self._exposure = exposure
+        self._exposures = HostDeviceBuffer(1, wp.float32, device)
+        self._exposures.write(exposure)
         self._view = None
-        posed = [hits.face, surfaces.normal, surfaces.plane]
+        posed_face, posed = hits.face, surfaces
         if changes is not None:
             self._view = view = ChangingView(
                 changes.mesh,
@@ -121,12 +123,16 @@ class Images:
                 device,
             )
             self._surfaces = surfaces = view.surfaces
-            posed = [view.posed_face, view.normal, view.plane]
+            posed_face, posed = view.posed_face, view.posed
+        self._tables = [StructTable(1, Surfaces, device) for _ in range(2)]
+        for table, of in zip(self._tables, (surfaces, posed), strict=True):
+            table.put(0, of)
+        shown, measured = (table.array for table in self._tables)
 
         def shading(shot: float, read: float) -> RecordedLaunch:
-            found = [self._poses.array, camera, span, hits, surfaces]
-            lookup = [self._keys.array, tables]
-            inputs = [*found, exposure, shot, read, *lookup, self._color.array]
+            seen = [hits, shown, self._exposures.array]
+            lookup = [self._keys.array, tables, self._color.array]
+            inputs = [self._poses.array, camera, span, *seen, shot, read, *lookup]
             return RecordedLaunch(shade, parts, inputs, device)
 
         self._shade = shading(noise.shot, noise.read)
@@ -136,7 +142,7 @@ class Images:
             inputs = [hits.t, hits.face, width, depth_noise, self._shadow]
             rows = batch * height
             self._measure.append(RecordedLaunch(projector_shadow, rows, inputs, device))
-        inputs = [self._poses.array, camera, span, hits.t, *posed]
+        inputs = [self._poses.array, camera, span, hits.t, posed_face, measured]
         inputs += [self._shadow, depth_noise, self._keys.array, tables.normals, self._depth.array]
         self._measure.append(RecordedLaunch(measure_depth, parts, inputs, device))
 
@@ -148,9 +154,7 @@ class Images:
             return
         times = np.zeros(len(poses)) if times_s is None else times_s
         self._view.look(self._cast, poses, times)
-        exposure = self._exposure * self._view.exposure_factor
-        for command in (self._shade, self._shade_ideal):
-            command.set_param("exposure", exposure)
+        self._exposures.write(self._exposure * self._view.exposure_factor)
 
     def capture(
         self,

@@ -71,8 +71,8 @@ def shade(
     camera: Pinhole,
     span: int,
     hits: Hits,  # of B * H * W rays
-    surfaces: Surfaces,
-    exposure: float,
+    surfaces: wp.array[Surfaces],  # (B,) of each image's scene; (1,) of all
+    exposure: wp.array[wp.float32],  # likewise
     shot: float,
     read: float,
     keys: wp.array2d[wp.uint32],  # (B, 2)
@@ -81,6 +81,7 @@ def shade(
 ) -> None:
     """Sensor value = exposure * radiance + noise; one thread for ``span`` pixels of a row."""
     b, y, part = wp.tid()
+    scene = wp.min(b, surfaces.shape[0] - 1)
     first = b * camera.height * camera.width
     x = part * span
     count = wp.min(span, camera.width - x)
@@ -92,8 +93,8 @@ def shade(
         x,
         count,
         hits,
-        surfaces,
-        exposure,
+        surfaces[scene],
+        exposure[scene],
         shot,
         read,
         keys[b, 0],

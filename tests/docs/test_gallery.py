@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from ms_slam_experiments.pictures.film import SHOWN_IDS
+from ms_slam_docs.film import SHOWN_IDS
 from PIL import Image
 
 from ms_slam_env import ENV_IDS

@@ -14,7 +14,8 @@ def test_rank_correlation_of_a_constant_is_zero():
 
 def test_one_line_a_setting_that_has_states():
     state = {f"{name}_{kind}": 0.5 for name in JUDGED for kind in KINDS}
-    rows = [{"error": None, "result": {"predictions": [{"variant": "default", **state}] * 2}}]
+    found = {"predictions": [{"variant": "default", **state}] * 2}
+    rows = [{"spec": {}, "error": None, "result": found}]
     (table,) = LookaheadRanking().tables(rows)
     (line,) = table.rows
     assert (line["variant"], line["states"]) == ("default", 2)

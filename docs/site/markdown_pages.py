@@ -37,12 +37,13 @@ import textwrap
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from ms_slam_docs.leaders import leaders
+from ms_slam_docs.model_cards import model_cards
+
 from ms_slam_env._runtime.input_files import read_text
 from ms_slam_env._runtime.output_files import write_text
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.metrics.registry import RESULTS_VERSIONS
-from ms_slam_env.report.leaders import leaders
-from ms_slam_env.report.model_cards import model_cards
 from ms_slam_env.report.results import RESULTS, Results, made_by, read_results
 from ms_slam_env.report.tables import Table
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from ms_slam_docs.leaders import leaders
 
-from ms_slam_env.benchmark.planner_tables import with_privilege
+from ms_slam_env.benchmark.planner_tables import PAIRS, with_privilege
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.report.leaders import PAIRS, leaders
 from ms_slam_env.report.results import Results, write_results
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import Column, Table, make_table

@@ -5,8 +5,8 @@ import itertools
 
 import numpy as np
 import pytest
-from ms_slam_experiments.pictures import film
-from ms_slam_experiments.pictures.film import Plan, run_script
+from ms_slam_docs import film
+from ms_slam_docs.film import Plan, run_script
 from PIL import Image, ImageSequence
 
 from ms_slam_env.errors import InputError

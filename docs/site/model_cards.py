@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ms_slam_env.benchmark.planner_tables import PAIRS
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.discovery import FoundResult, find_results
-from ms_slam_env.report.leaders import PAIRS
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import Table, format_value
 from ms_slam_env.scenes import SEED_SPLITS, seeds_of, split_of

@@ -8,11 +8,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+from ms_slam_docs.markdown_pages import with_tables
 
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics.registry import RESULTS_VERSIONS
-from ms_slam_env.report.markdown_pages import with_tables
 from ms_slam_env.report.results import pack_results, read_results, write_results
 from ms_slam_env.report.tables import make_table
 

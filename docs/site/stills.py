@@ -1,4 +1,4 @@
-"""Pictures for the pages: `python -m ms_slam_experiments.pictures.stills scenes homes usme arm`.
+"""Pictures for the pages: `python -m ms_slam_docs.stills scenes homes usme arm`.
 
 ``scenes``: two seeds of each scene in colour, depth and normals, as seen by an ideal sensor from
 the scene's start poses. ``homes``: floor plans, seen from far above without the ceilings, and
@@ -53,7 +53,7 @@ def run_script(
 
     ``draw`` writes the options' ``out`` and returns a line to print.
     """
-    name = f"python -m ms_slam_experiments.pictures.{Path(inspect.getfile(options)).stem}"
+    name = f"python -m ms_slam_docs.{Path(inspect.getfile(options)).stem}"
 
     def run() -> int:
         args: Any = parse(options, arguments, name, check_out)

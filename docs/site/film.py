@@ -1,4 +1,4 @@
-"""``python -m ms_slam_experiments.pictures.film``: show an episode of a planner as an animation.
+"""``python -m ms_slam_docs.film``: show an episode of a planner as an animation.
 
 Without options, it makes the picture at the top of the README: a planner explores a home. With
 ``--gallery``, it makes the films of the gallery, one episode of each id.
@@ -16,7 +16,7 @@ from typing import Any, cast
 import cv2
 import gymnasium
 import numpy as np
-from ms_slam_experiments.pictures.stills import Image, run_script
+from ms_slam_docs.stills import Image, run_script
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 

@@ -5,21 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+from ms_slam_env.benchmark.planner_tables import PAIRS, PRIVILEGED
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.report.results import Results
 from ms_slam_env.report.statistics import Interval
 from ms_slam_env.report.tables import Column, Table, make_table
 
-PAIRS = {
-    "f_score_5cm": "Share of pairs, by final F-score",
-    "f_score_5cm_area": "Share of pairs, by area under the F-score",
-    "return": "Share of pairs, by return",
-}
-"""Metrics that planners are compared by, and the titles of the tables of every two planners."""
-
 _ACROSS = ": over all scenes"
-PRIVILEGED = "privileged"
-"""Column of whether a planner sees the truth."""
 
 
 def leaders(

@@ -6,9 +6,9 @@ import cv2
 import mujoco
 import numpy as np
 import pytest
+from ms_slam_docs import stills
+from ms_slam_docs.stills import LABEL, Options, run_script, save, scene_with
 from ms_slam_experiments.arm_masks import floor_below
-from ms_slam_experiments.pictures import stills
-from ms_slam_experiments.pictures.stills import LABEL, Options, run_script, save, scene_with
 from numpy.testing import assert_allclose
 
 from ms_slam_env._runtime.output_files import check_out_folder

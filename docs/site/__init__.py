@@ -1,0 +1,1 @@
+"""The pages of a checkout: their tables and model cards, and the site."""

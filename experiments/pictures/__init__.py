@@ -1,1 +1,0 @@
-"""Pictures of maps, scenes, the arm and an episode."""
