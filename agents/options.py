@@ -175,6 +175,29 @@ class PpoTraining(Training):
     clip_range: float = bounded(0.2, 0, 1)
 
 
+@dataclass(frozen=True)
+class ReplayTraining(Training):
+    """Options of learning from a replay of past steps.
+
+    Attributes:
+        buffer_size: transitions kept; each holds two observations of 4-byte numbers.
+        learning_starts: environment steps before the first gradient step, of each run.
+        train_every: environment steps between gradient steps.
+        target_every: gradient steps between copies of the network to the target's.
+        epsilon: final share of random actions, from 1 at the start.
+        exploration: share of ``total_timesteps`` over which the share of random actions falls.
+        save_every: environment steps between saved files.
+    """
+
+    buffer_size: int = bounded(100_000, 2, 100_000_000)
+    learning_starts: int = bounded(5_000, 1, 1_000_000_000)
+    train_every: int = bounded(4, 1, 1_000_000)
+    target_every: int = bounded(500, 1, 1_000_000_000)
+    epsilon: float = bounded(0.02, 0, 1)
+    exploration: float = bounded(0.2, 0, 1)
+    save_every: int = bounded(2_000, 1, 1_000_000_000)
+
+
 TASKS = Path(__file__).parent / "hyperparameters"
 P = TypeVar("P", bound=Problem)
 
