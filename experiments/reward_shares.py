@@ -16,6 +16,7 @@ from ms_slam_env.benchmark.episodes import (
     play,
     short_planner_names,
 )
+from ms_slam_env.benchmark.planner_tables import from_the_same_start
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.env.reward import DIVERGENCE_AND_ERROR
 from ms_slam_env.report.records import Row
@@ -73,14 +74,15 @@ class RewardShares(SteppedExperiment):
     run = staticmethod(run_terms)
 
     def tables(self, rows: Sequence[Row]) -> list[Table]:
-        """One line per planner: means."""
+        """One line per planner: means, and in how many pairs it earns more than each other."""
         names = short_planner_names(row["spec"]["planner"] for row in rows)
         lines: list[Mapping[str, Any]] = []
         for (planner,), results in grouped(rows, ("planner",)).items():
-            means = {key: float(np.mean([one[key] for one in results])) for key in _SHOWN}
-            lines.append({"planner": names[planner], "episodes": len(results), **means})
+            line = {key: float(np.mean([one[key] for one in results])) for key in _SHOWN}
+            lines.append({"planner": names[planner], "episodes": len(results), **line})
         note = "Means over the episodes; the terms sum to the return."
-        return [make_table(("planner", "episodes", *_SHOWN), lines, note=note)]
+        means = make_table(("planner", "episodes", *_SHOWN), lines, note=note)
+        return [means, *from_the_same_start(rows, metric="return")]
 
 
 _SHOWN = ("return", *TERMS, "terminated")

@@ -28,6 +28,9 @@ def test_the_terms_sum_to_the_return(rows):
 
 def test_a_line_for_each_planner(rows):
     experiment, played = rows
-    (table,) = experiment.tables(played)
+    table, pairs = experiment.tables(played)
+    assert pairs.rows[0]["planner"] == "stationary"
+    assert pairs.rows[0]["random"].value == 1
+    assert "Share of 1 starts from which a line's planner has the larger return" in pairs.note
     assert [line["planner"] for line in table.rows] == ["random", "stationary"]
     assert table.rows[0]["return"] == played[0]["result"]["return"]
