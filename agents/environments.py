@@ -8,7 +8,6 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
 from typing import Any
 
 import gymnasium as gym
@@ -23,7 +22,7 @@ from ms_slam_agents.through_planner import ThroughPlanner
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 import ms_slam_env  # registers the ids, in a worker process too
-from ms_slam_env.env.reward import RewardConfig
+from ms_slam_env.env.reward import DEFAULT
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.gym_ids import BATCHED_IDS
 
@@ -69,9 +68,9 @@ def problem_options(args: Problem, split: str) -> dict[str, Any]:
     if args.image_size is not None:
         few["image_size"] = args.image_size
     if args.without:
-        weights = asdict(RewardConfig.named()[args.reward])
-        few["reward"] = weights | dict.fromkeys(args.without, 0.0)
-    elif args.reward != "default":
+        named = {} if args.reward == DEFAULT else {"name": args.reward}
+        few["reward"] = named | dict.fromkeys(args.without, 0.0)
+    elif args.reward != DEFAULT:
         few["reward"] = args.reward
     stays = getattr(args, "episodes_per_scene", 1)
     if split == "train" and stays > 1:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_ty
 from ms_slam_env._runtime.input_files import read_text
 from ms_slam_env.config import Checked, bounded, chosen, from_dict, load_yaml
 from ms_slam_env.env.registry import POINT as OBSERVATIONS
-from ms_slam_env.env.reward import RewardConfig
+from ms_slam_env.env.reward import DEFAULT, RewardConfig
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.slam.configuration import is_file_name
 
@@ -41,7 +41,7 @@ class Problem(Checked):
             some ten, for a free camera the environment's default. With ``--embodiment arm-kinematic
             --frames-per-action 1`` a step costs little more than the free camera's, which suits
             pretraining for the arm itself (``--init``).
-        reward: preset of the environment's reward, `default` or `paper`.
+        reward: `divergence-and-error`, `mapping` or `paper`; `default`: the environment's own.
         without: reward terms to ignore.
         image_size: of the camera in training and validation, width x height; None: the
             environment's default. At 80x60 a step costs half as much, and SLAM loses track more
@@ -65,7 +65,7 @@ class Problem(Checked):
     step_m: float | None = bounded(None, 0, 1)
     step_deg: float | None = bounded(None, 0, 90)
     frames_per_action: int | None = bounded(None, 1, 1000)
-    reward: str = chosen("default", *RewardConfig.named())
+    reward: str = chosen(DEFAULT, DEFAULT, *RewardConfig.named())
     without: tuple[str, ...] = ()
     image_size: str | None = None
     num_envs: int = bounded(2, 1, 100_000)
@@ -183,6 +183,29 @@ class PpoTraining(Training):
     gae_lambda: float = bounded(0.95, 0, 1)
     ent_coef: float = bounded(0.003, 0, 1)
     clip_range: float = bounded(0.2, 0, 1)
+
+
+@dataclass(frozen=True)
+class ReplayTraining(Training):
+    """Options of learning from a replay of past steps.
+
+    Attributes:
+        buffer_size: transitions kept; each holds two observations of 4-byte numbers.
+        learning_starts: environment steps before the first gradient step, of each run.
+        train_every: environment steps between gradient steps.
+        target_every: gradient steps between copies of the network to the target's.
+        epsilon: final share of random actions, from 1 at the start.
+        exploration: share of ``total_timesteps`` over which the share of random actions falls.
+        save_every: environment steps between saved files.
+    """
+
+    buffer_size: int = bounded(100_000, 2, 100_000_000)
+    learning_starts: int = bounded(5_000, 1, 1_000_000_000)
+    train_every: int = bounded(4, 1, 1_000_000)
+    target_every: int = bounded(500, 1, 1_000_000_000)
+    epsilon: float = bounded(0.02, 0, 1)
+    exploration: float = bounded(0.2, 0, 1)
+    save_every: int = bounded(2_000, 1, 1_000_000_000)
 
 
 TASKS = Path(__file__).parent / "hyperparameters"

@@ -31,7 +31,7 @@ from ms_slam_env.report.records import build, to_plain
 Tensors = dict[str, NDArray[Any]]
 Shapes = dict[str, tuple[int, ...]]
 
-ALGORITHMS = ("maskable_ppo", "ppo", "imitation", "masked_ppo", "rllib_ppo", "qr_dqn")
+ALGORITHMS = ("maskable_ppo", "ppo", "dqn", "imitation", "masked_ppo", "rllib_ppo", "qr_dqn")
 VERSION = 1
 STEP = "optimizer.step"
 MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, each of its parameter's shape

@@ -19,7 +19,7 @@ from ms_slam_env._runtime.command_line import parse
 from ms_slam_env.config import from_dict, parse_named
 from ms_slam_env.env.planners import PLANNERS
 from ms_slam_env.env.registry import POINT as OBSERVATIONS
-from ms_slam_env.env.reward import RewardConfig
+from ms_slam_env.env.reward import DEFAULT, RewardConfig
 from ms_slam_env.errors import InputError
 from ms_slam_env.report.records import to_plain
 from ms_slam_env.report.results import RESULTS
@@ -84,7 +84,7 @@ _NAMES: dict[str, Callable[[str], bool]] = {
     "env_id": _one_of(lambda: gym.registry),
     "image_size": lambda text: re.fullmatch("[0-9]+x[0-9]+", text) is not None,
     "observation": _one_of(OBSERVATIONS.names),
-    "reward": _one_of(RewardConfig.named),
+    "reward": _one_of(lambda: [DEFAULT, *RewardConfig.named()]),
     "scenes": _one_of(SCENES.names),
     "task": _one_of(shipped_tasks),
     "teacher": _is_planner,

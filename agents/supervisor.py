@@ -10,7 +10,7 @@ import numpy as np
 from ms_slam_agents.learning_curve import LATEST, Curve
 from ms_slam_agents.policy import action_parts
 from ms_slam_agents.policy_file import PolicyFile, write_policy
-from ms_slam_agents.sb3_state import Model, tensors_of, update_on_partial_rollout
+from ms_slam_agents.sb3_state import Model, epochs_of, tensors_of, update_on_partial_rollout
 from ms_slam_agents.trainers import Sb3Args as Args
 from ms_slam_agents.training_run import metadata_of, stage_of
 from stable_baselines3.common.callbacks import BaseCallback
@@ -50,6 +50,7 @@ class Supervisor(BaseCallback):
         """Whether only the last evaluation remained."""
         self._minutes_before = minutes_before
         self._evaluation_s = 0.0
+        self._next_save = 0
         self._provenance = provenance()
         self._bar = Bar(disable=True)
 
@@ -97,7 +98,8 @@ class Supervisor(BaseCallback):
         return self.model._n_updates > self._epochs_before
 
     def _on_rollout_start(self) -> None:
-        self._save_latest()
+        if self.num_timesteps >= self._next_save:
+            self._save_latest()
         if self.num_timesteps >= self._next_evaluation:
             self._evaluate()
             self._plan_evaluation()
@@ -140,6 +142,8 @@ class Supervisor(BaseCallback):
 
     def _save_latest(self) -> None:
         write_policy(self.args.out / LATEST, self.policy_file())
+        if self.args.algorithm == "dqn":  # whose rollouts are a few steps
+            self._next_save = self.num_timesteps + self.args.save_every
 
     def policy_file(self) -> PolicyFile:
         """The current policy, with the state of the optimiser."""
@@ -151,7 +155,8 @@ class Supervisor(BaseCallback):
             inputs=space.shape[0],
             actions=action_parts(self.training_env.action_space),
             timesteps=self.num_timesteps,
-            epochs=self.model._n_updates,
+            epochs=epochs_of(self.model),
+            quantiles=self.args.layers["quantiles"],
             minutes=self._minutes_before + self.minutes,
             provenance=self._provenance,
         )

@@ -1,4 +1,4 @@
-"""Train a camera-motion policy with PPO (Stable-Baselines3), with or without action masks.
+"""Train a camera-motion policy with Stable-Baselines3: PPO with or without action masks, or DQN.
 
     ms-slam train sb3 --out runs/ppo --minutes 60
 
@@ -13,8 +13,10 @@ from __future__ import annotations
 
 import math
 import sys
+from typing import Any
 
 import torch
+from gymnasium.spaces import Discrete
 from ms_slam_agents.environments import (
     VALIDATION_SEED,
     check_problem,
@@ -42,28 +44,24 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 from ms_slam_env._runtime.interrupts import kept
 from ms_slam_env._runtime.result_folders import own_folder
+from ms_slam_env.errors import InputError
 
 
 def make_model(args: Args, venv: VecEnv, file: PolicyFile | None) -> Model:
     """Build the model on normalised environments, new or as it stands in ``file``."""
     normalize = VecNormalize(VecMonitor(venv), gamma=args.gamma)
     done = file.metadata.timesteps if file else 0
-    n_steps = rollout_steps(args, venv.num_envs, done)
+    options = options_of_dqn if args.algorithm == "dqn" else options_of_ppo
     model = ALGORITHMS[args.algorithm](
         "MlpPolicy",
         normalize,
         learning_rate=args.learning_rate,
-        n_steps=n_steps,
-        batch_size=whole_batches(n_steps * venv.num_envs, args.batch_size),
-        n_epochs=args.n_epochs,
         gamma=args.gamma,
-        gae_lambda=args.gae_lambda,
-        ent_coef=args.ent_coef,
-        clip_range=args.clip_range,
-        policy_kwargs={"net_arch": [args.hidden, args.hidden]},
+        policy_kwargs={"net_arch": [args.hidden, args.hidden], "activation_fn": torch.nn.Tanh},
         tensorboard_log=str(args.out / "tensorboard"),
         seed=args.seed + done,  # a resumed run goes on with new episodes
         device="cpu",
+        **options(args, venv, done),
     )
     venv.seed(first_seed(args.seed, done))
     if file:
@@ -75,6 +73,39 @@ def make_model(args: Args, venv: VecEnv, file: PolicyFile | None) -> Model:
         init.metadata.check_sizes(args.init, venv.observation_space.shape[0], *actions)
         restore(model, init.untrained())
     return model
+
+
+def options_of_ppo(args: Args, venv: VecEnv, done: int) -> dict[str, Any]:
+    """Options of PPO after ``done`` steps."""
+    n_steps = rollout_steps(args, venv.num_envs, done)
+    return {
+        "n_steps": n_steps,
+        "batch_size": whole_batches(n_steps * venv.num_envs, args.batch_size),
+        "n_epochs": args.n_epochs,
+        "gae_lambda": args.gae_lambda,
+        "ent_coef": args.ent_coef,
+        "clip_range": args.clip_range,
+    }
+
+
+def options_of_dqn(args: Args, venv: VecEnv, done: int) -> dict[str, Any]:
+    """Options of DQN after ``done`` steps; its replay starts empty.
+
+    Raises:
+        InputError: an action of several parts.
+    """
+    if not isinstance(venv.action_space, Discrete):
+        raise InputError(f"{args.env_id} has actions of several numbers: use PPO, not DQN")
+    return {
+        "buffer_size": args.buffer_size,
+        "batch_size": args.batch_size,
+        "learning_starts": done + args.learning_starts,
+        "train_freq": max(1, args.train_every // venv.num_envs),
+        "gradient_steps": max(1, venv.num_envs // args.train_every),
+        "target_update_interval": args.target_every * args.train_every,
+        "exploration_fraction": args.exploration,
+        "exploration_final_eps": args.epsilon,
+    }
 
 
 def rollout_steps(args: Args, num_envs: int, done: int) -> int:
@@ -134,10 +165,13 @@ def report(supervisor: Supervisor) -> int:
     args, steps = supervisor.args, supervisor.num_timesteps
     ended = supervisor.stop_reason or "done"
     if not supervisor.has_learnt and not supervisor.signal and not supervisor.was_done:
-        raise RuntimeError(
-            f"{ended}, but nothing was learnt: {supervisor.unlearnt_steps} steps are less than a "
-            f"batch of {args.batch_size}; give more --minutes or a smaller --batch-size"
+        why = (
+            f"{steps} steps are not more than --learning-starts {args.learning_starts}"
+            if args.algorithm == "dqn"
+            else f"{supervisor.unlearnt_steps} steps are less than a batch of {args.batch_size}; "
+            "give more --minutes or a smaller --batch-size"
         )
+        raise RuntimeError(f"{ended}, but nothing was learnt: {why}")
     learnt = "" if supervisor.has_learnt else "; nothing was learnt in this run"
     if supervisor.unlearnt_steps:
         learnt += f"; the last {supervisor.unlearnt_steps} steps, less than a batch, are not in it"

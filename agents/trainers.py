@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
-from ms_slam_agents.options import PpoTraining, Problem, Training
+from ms_slam_agents.options import PpoTraining, Problem, ReplayTraining
 from ms_slam_agents.resume import parse_options
 
 from ms_slam_env._runtime.command_line import exit_code, parse
@@ -19,15 +19,18 @@ from ms_slam_env._runtime.extension import ExtensionPoint
 from ms_slam_env.config import bounded
 from ms_slam_env.errors import InputError
 
-Sb3Algorithm = Literal["maskable_ppo", "ppo"]
+Sb3Algorithm = Literal["maskable_ppo", "ppo", "dqn"]
 
 
 @dataclass(frozen=True)
-class Sb3Args(PpoTraining):
-    """Train a camera-motion policy with PPO; these options are the command line.
+class Sb3Args(PpoTraining, ReplayTraining):
+    """Train a camera-motion policy with PPO or DQN; these options are the command line.
+
+    Those from ``buffer_size`` to ``save_every`` are DQN's; ``n_steps``, ``n_epochs``,
+    ``gae_lambda``, ``ent_coef`` and ``clip_range`` are PPO's.
 
     Attributes:
-        algorithm: PPO over the actions that are not blocked, or over all of them.
+        algorithm: PPO over the actions that are not blocked, or PPO or DQN over all of them.
     """
 
     out: Path = Path("runs/sb3")
@@ -44,7 +47,8 @@ class Sb3Args(PpoTraining):
     @property
     def layers(self) -> dict[str, Any]:
         """See `Problem`; Stable-Baselines3 sees one long vector."""
-        return {**super().layers, "candidates": 0, "image": ()}
+        quantiles = int(self.algorithm == "dqn")  # the value of an action is its one quantile
+        return {**super().layers, "candidates": 0, "image": (), "quantiles": quantiles}
 
 
 @dataclass(frozen=True)
@@ -134,33 +138,19 @@ class PpoArgs(PpoTraining):
 
 
 @dataclass(frozen=True)
-class QrdqnArgs(Training):
+class QrdqnArgs(ReplayTraining):
     """Train with masked QR-DQN; these options are the command line.
 
     Attributes:
         quantiles: number of quantiles of the return per action.
         n_step: number of rewards in a return before the target network's estimate is used.
-        buffer_size: transitions kept; each holds two observations of 4-byte numbers.
         batch_size: of the gradient steps, in transitions.
-        learning_starts: environment steps before the first gradient step, of each run.
-        train_every: environment steps between gradient steps.
-        target_every: gradient steps between copies of the network to the target's.
-        epsilon: final share of random actions, from 1 at the start.
-        exploration: share of ``total_timesteps`` over which the share of random actions falls.
-        save_every: environment steps between saved files.
     """
 
     out: Path = Path("runs/qrdqn")
     quantiles: int = bounded(32, 1, 1000)
     n_step: int = bounded(3, 1, 1000)
-    buffer_size: int = bounded(100_000, 2, 100_000_000)
     batch_size: int = bounded(128, 1, 1_000_000)
-    learning_starts: int = bounded(5_000, 1, 1_000_000_000)
-    train_every: int = bounded(4, 1, 1_000_000)
-    target_every: int = bounded(500, 1, 1_000_000_000)
-    epsilon: float = bounded(0.02, 0, 1)
-    exploration: float = bounded(0.2, 0, 1)
-    save_every: int = bounded(2_000, 1, 1_000_000_000)
 
     algorithms = ("qr_dqn",)
     kept: ClassVar[tuple[str, ...]] = ("quantiles",)
@@ -251,7 +241,7 @@ _TRAINING = ExtensionPoint(
 
 
 def sb3(argv: Sequence[str] | None = None) -> int:
-    """Masked PPO of Stable-Baselines3, without memory; the default.
+    """Masked PPO, PPO or DQN of Stable-Baselines3, without memory; the default.
 
     Returns:
         the exit code: 0, 1 if nothing was learnt, 2, 130 or 143.

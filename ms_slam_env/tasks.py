@@ -29,7 +29,8 @@ class Task(Checked):
         reference: the true surface that a map should cover: ``nearby``, visible from within a
             straight path of 1 m of the start; ``scene``, visible from anywhere the camera can go;
             ``arm``, visible from anywhere the arm can bring it.
-        options: environment options; ``slam_config`` applies to ``surfel`` only.
+        options: environment options; ``slam_config`` applies to ``surfel`` only, and ``reward`` is
+            ``mapping`` if not given.
         perturbations: camera perturbations, name to options.
     """
 

@@ -259,6 +259,7 @@ LIGHT_EXPERIMENTS = [
     "pose_covariance",
     "pose_sources",
     "relocalization",
+    "reward_shares",
     "soak",
     "step_size",
     "usme",

@@ -185,21 +185,31 @@ def _two_by_two(
     return make_table(["planner", *columns], lines, title, note)
 
 
-def from_the_same_start(rows: Sequence[Row], prefix: str = "") -> list[Table]:
+FROM_STARTS = {
+    "f_score_5cm_area": ("area under the F-score", "area under F-score over steps", "sooner_share"),
+    "return": ("return", "return", "richer_share"),
+}
+"""Metrics compared start by start: name in a title and in a note, and metric of the shares."""
+
+
+def from_the_same_start(
+    rows: Sequence[Row], prefix: str = "", metric: str = "f_score_5cm_area"
+) -> list[Table]:
     """Tabulate the share of starts from which a row's planner has a larger area than a column's.
 
     This separates planners where each seed makes another place, as in `home`: there the areas
     differ more between places than between planners. Only starts that every planner finished
     count and, for a pair of planners, only those with different areas. Empty for a single planner.
+    The same of another ``metric`` of FROM_STARTS.
     """
-    area = "f_score_5cm_area"
-    known = [row for row in finished(rows) if area in row["result"]]  # older results have no area
+    by, what, shown = FROM_STARTS[metric]
+    known = [row for row in finished(rows) if metric in row["result"]]  # older ones have no area
     pairs = complete_cases(known, ("scene", "seed"), "planner")
     pairs.sort(key=lambda row: (row["spec"]["scene"], row["spec"]["seed"]))
     results = {name: of for (name,), of in grouped(pairs, ("planner",)).items()}
     if len(results) < 2:
         return []
-    values = {name: np.array([result[area] for result in of]) for name, of in results.items()}
+    values = {name: np.array([result[metric] for result in of]) for name, of in results.items()}
     names = sorted(values, key=lambda name: -float(np.median(values[name])))
     label, count = short_planner_names(names), len(values[names[0]])
 
@@ -208,12 +218,12 @@ def from_the_same_start(rows: Sequence[Row], prefix: str = "") -> list[Table]:
         return statistics.share_interval(more[more != 0] > 0) if more.any() else None
 
     lines = [{"planner": one, **{other: share(one, other) for other in names}} for one in names]
-    columns = [Column(name, "sooner_share", label[name]) for name in names]
+    columns = [Column(name, shown, label[name]) for name in names]
     note = (
-        f"Share of {count} starts from which a line's planner has the larger area under "
-        "F-score over steps than a column's, with 95 % Wilson intervals."
+        f"Share of {count} starts from which a line's planner has the larger {what} than a "
+        "column's, with 95 % Wilson intervals."
     )
-    title = f"{prefix}Share of starts, by area under the F-score"
+    title = f"{prefix}Share of starts, by {by}"
     return [make_table(["planner", *columns], lines, title, note)]
 
 

@@ -70,17 +70,19 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     one is added one-hot (K,): at the end of the vector, or as ``slam_configuration``.
 
     ## Reward
-    The sum of these terms (``info["reward_terms"]``), each times its weight (option ``reward``):
-    ``intensity_divergence`` and ``depth_divergence``, -0.5 per M_I and M_D of distance to the
-    target, each distance capped at 0.4, depth times lambda (0.1); ``trajectory_error``, -10 per
-    metre of growth of the pose error, capped at 0.1 m either way; ``new_surface``, +1 per m2 newly
-    mapped in its true place; ``lost``, -0.5 per lost step; ``lost_for_good``, -10 once;
-    ``blocked``, -0.1 per masked action; where the agent chooses the SLAM configuration,
-    ``compute``, -0.1 times its cost, a fixed number (``adaptation.costs``) rather than a measured
-    time, so that runs are reproducible.
-    Scale: random possible motions in a living room earned -0.2 to 1.6 in 90 % of the steps with the
-    arm and -0.4 to 1.3 with the free camera. The extremes were -1.7 (lost) and 4.0, and -10.8 to
-    -11.7 in the last step of an episode whose tracking was never recovered.
+    The sum of these terms (``info["reward_terms"]``), each times its weight (option ``reward``).
+    ``divergence-and-error``, without a task: ``intensity_divergence`` and ``depth_divergence``,
+    -0.5 per M_I and M_D of distance to the target, each distance capped at 0.4, depth times lambda
+    (0.1); ``ate_growth``, -100 per metre of growth of ``info["ate"]``, in all -100 times the final
+    ATE; ``lost``, -0.5 per lost step; ``lost_for_good``, -30 once; ``blocked``, -0.1 per masked
+    action; where the agent chooses the SLAM configuration, ``compute``, -0.1 times its cost, a
+    fixed number (``adaptation.costs``) rather than a measured time, so that runs are reproducible.
+    ``mapping``, with a task: the same, but ``new_surface``, +1 per m2 newly mapped in its true
+    place, and ``trajectory_error``, -10 per metre of growth of the pose error, capped at 0.1 m
+    either way, instead of ``ate_growth``; ``lost_for_good`` is -10.
+    Scale of ``mapping``: random possible motions in a living room earned -0.2 to 1.6 in 90 % of the
+    steps with the arm and -0.4 to 1.3 with the free camera. The extremes were -1.7 (lost) and 4.0,
+    and -10.8 to -11.7 in the last step of an episode whose tracking was never recovered.
 
     ## Start
     A free pose of the scene, drawn from the seed; SLAM starts at the true pose with one frame.
@@ -233,12 +235,13 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         """Make a motion; return its reward and whether tracking is lost beyond recovery."""
         episode = self.episode
         episode.action = self._actions.decode(action)
-        error_before = episode.pose_error
+        error_before, ate_before = episode.pose_error, episode.ate
         made, new_surface = self.simulation.move(episode)
         lost_for_good = self._lost_share() >= 1
         outcome = Outcome(
             divergence=episode.divergence,
             pose_error_growth_m=episode.pose_error - error_before,
+            ate_growth_m=episode.ate - ate_before,
             new_surface_m2=new_surface,
             tracking_ok=episode.tracking_ok,
             lost_for_good=lost_for_good,

@@ -25,7 +25,7 @@ from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.env.pose_sources import POSE_SOURCES
 from ms_slam_env.env.registry import POINT as OBSERVATION_POINT
 from ms_slam_env.env.registry import Observation
-from ms_slam_env.env.reward import RewardConfig, TargetConfig
+from ms_slam_env.env.reward import DEFAULT, RewardConfig, TargetConfig
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.robot.arm import ArmConfig
 from ms_slam_env.scenes import SCENES, SEED_SPLITS, seeds_of
@@ -124,9 +124,11 @@ class EnvConfig(Checked):
             ``info`` and the reward use: with the arm, nine out of ten measurements fewer.
         lookahead: how candidates are predicted.
         targets: motion-and-structure parameters and thresholds.
-        reward: weights of the reward terms, or ``paper`` for the paper's. Or a function, or its
-            name ``module:function``, of a step's ``Outcome`` that returns a number, or terms by
-            name whose sum is the reward; a class of such functions is made without arguments.
+        reward: ``divergence-and-error``, ``mapping`` (that of tasks) or ``paper``; or a mapping
+            with such a ``name`` and weights of terms, without a name those of the default; see
+            ``RewardConfig``. Or a function, or its name ``module:function``, of a step's
+            ``Outcome`` that returns a number, or terms by name whose sum is the reward; a class of
+            such functions is made without arguments.
     """
 
     scene: SceneName | tuple[SceneName, ...] = "living_room"
@@ -238,10 +240,14 @@ REWARDS = ExtensionPoint("reward", "ms_slam_env.rewards", form="module:function"
 
 def _reward(given: object) -> RewardConfig | Callable[..., Any]:
     """Weights, or a function."""
-    presets = RewardConfig.named()
+    presets = {DEFAULT: RewardConfig(), **RewardConfig.named()}
     named = ", ".join(presets)
     if isinstance(given, Mapping):
-        return from_dict(RewardConfig, given, "reward")
+        name, weights = given.get("name", DEFAULT), {**given}
+        if not isinstance(name, str) or name not in presets:
+            raise unknown("reward.name", name, presets)
+        weights.pop("name", None)
+        return from_dict(RewardConfig, dataclasses.asdict(presets[name]) | weights, "reward")
     if isinstance(given, str) and given in presets:
         return presets[given]
     if isinstance(given, RewardConfig):

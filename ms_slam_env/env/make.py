@@ -9,6 +9,7 @@ from ms_slam_env._runtime.extension import load_reference
 from ms_slam_env.config import is_options, parse_named
 from ms_slam_env.env.active_slam import VIEWS, ActiveSlamEnv
 from ms_slam_env.env.env_config import EnvConfig
+from ms_slam_env.env.reward import DEFAULT, MAPPING
 from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.sequences.perturbations import make_perturbation
 from ms_slam_env.tasks import Task, find_task
@@ -51,9 +52,16 @@ def _make_for(task: Task, perturbed_by: str | None, **options: Any) -> ActiveSla
 def options_for(task: Task, options: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a task's environment: the task's own, overridden by ``options``.
 
+    The reward is ``mapping`` unless the task has its own; weights without a name change it.
     Single options of ``slam_config`` are overridden, too. The task's are dropped for another SLAM.
     """
-    own: dict[str, Any] = {"scene": task.scenes, **task.options}
+    own: dict[str, Any] = {"scene": task.scenes, "reward": MAPPING, **task.options}
+    reward = options.get("reward", DEFAULT)
+    if isinstance(reward, str) and reward == DEFAULT:
+        options = {**options, "reward": own["reward"]}
+    elif is_options(reward) and "name" not in reward:
+        base = own["reward"] if is_options(own["reward"]) else {"name": own["reward"]}
+        options = {**options, "reward": {**base, **reward}}
     configured, given = own.pop("slam_config", {}), options.get("slam_config", {})
     slam = options.get("slam", "surfel")
     is_surfel = isinstance(slam, str) and parse_named(slam, "backend")[0] == "surfel"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,15 @@ from numpy.typing import NDArray
 
 from ms_slam_env.config import Checked, Named, bounded
 from ms_slam_env.errors import InputError
+
+DIVERGENCE_AND_ERROR = "divergence-and-error"
+"""Name of the reward of every environment without a task."""
+
+MAPPING = "mapping"
+"""Name of the reward of the tasks."""
+
+DEFAULT = "default"
+"""Name of the environment's own reward, one of these two."""
 
 _DISTANCE_CAP = 0.4  # in units of M: one violent frame must not outweigh a whole episode
 _ERROR_CAP_M = 0.1  # a lost camera's error is arbitrary; the terms for lost tracking penalize it
@@ -59,13 +68,18 @@ class TargetConfig(Checked):
 class RewardConfig(Checked, Named):
     """Weights of the reward terms; see :func:`reward_terms` for each term.
 
-    ``paper`` uses the criterion of the paper's planner, the distances to the divergence targets,
-    and its measure of success, the trajectory error; it does not reward mapping.
+    The defaults are those of ``divergence-and-error``: move as the divergence targets ask, keep the
+    trajectory error small, do not get lost. ``mapping`` pays for new surface, which tasks ask for.
+    ``paper`` has neither costs of getting lost nor the whole trajectory's error: only the
+    distances to the targets and the growth of the pose error.
 
     Attributes:
         intensity_divergence: per M_I of distance to the intensity target.
         depth_divergence: per M_D of distance to the depth target (times lambda).
-        trajectory_error: per metre of growth of the pose error.
+        ate_growth: per metre of growth of the ATE, the RMSE of the positions so far. The terms of
+            an episode sum to minus this weight times the final ``info["ate"]``.
+        trajectory_error: per metre of growth of the pose error, so that an episode's terms sum to
+            the last frame's error alone, less what exceeds the cap.
         new_surface: per square metre of surface newly mapped in its true place.
         lost: per step with tracking lost.
         lost_for_good: once, when the episode ends because tracking was lost beyond recovery.
@@ -76,18 +90,24 @@ class RewardConfig(Checked, Named):
 
     intensity_divergence: float = bounded(0.5, 0, 1e6)
     depth_divergence: float = bounded(0.5, 0, 1e6)
-    trajectory_error: float = bounded(10.0, 0, 1e6)
-    new_surface: float = bounded(1.0, 0, 1e6)
+    ate_growth: float = bounded(100.0, 0, 1e6)
+    trajectory_error: float = bounded(0.0, 0, 1e6)
+    new_surface: float = bounded(0.0, 0, 1e6)
     lost: float = bounded(0.5, 0, 1e6)
-    lost_for_good: float = bounded(10.0, 0, 1e6)
+    lost_for_good: float = bounded(30.0, 0, 1e6)
     blocked: float = bounded(0.1, 0, 1e6)
     compute: float = bounded(0.1, 0, 1e6)
 
     @classmethod
     def named(cls) -> Mapping[str, RewardConfig]:
         """The named weights."""
-        unasked = ("new_surface", "lost", "lost_for_good", "blocked", "compute")
-        return {"default": cls(), "paper": cls(**dict.fromkeys(unasked, 0.0))}
+        error = cls(ate_growth=0.0, trajectory_error=10.0)
+        unasked = ("lost", "lost_for_good", "blocked", "compute")
+        return {
+            DIVERGENCE_AND_ERROR: cls(),
+            MAPPING: replace(error, new_surface=1.0, lost_for_good=10.0),
+            "paper": replace(error, **dict.fromkeys(unasked, 0.0)),
+        }
 
 
 @dataclass(frozen=True)
@@ -97,6 +117,7 @@ class Outcome:
     Attributes:
         divergence: (2,) intensity and depth divergence between the last two live frames.
         pose_error_growth_m: change of the distance between true and estimated position.
+        ate_growth_m: change of ``info["ate"]``.
         new_surface_m2: surface newly mapped in its true place.
         tracking_ok: whether the frame was tracked.
         lost_for_good: whether the episode ends because tracking was lost beyond recovery.
@@ -106,6 +127,7 @@ class Outcome:
 
     divergence: NDArray[np.float64]
     pose_error_growth_m: float
+    ate_growth_m: float
     new_surface_m2: float
     tracking_ok: bool
     lost_for_good: bool
@@ -126,9 +148,12 @@ def reward_terms(
     number.
 
     The two divergence terms are the summands of Algorithm 1, line 9, in units of M_I and M_D so
-    that one weight suits every scene; alone they would make an agent imitate the greedy planner.
-    Surface newly mapped in its true place is the goal: neither standing still nor getting lost
-    earns any. The error terms penalize at once what would cost surface only later.
+    that one weight suits every scene. Their targets are above 0: a camera at rest misses them.
+    No other term of ``divergence-and-error`` is positive, so a lost episode must not save what the
+    rest of it would have cost: ``lost`` is more than the largest distances of a step, and
+    ``lost_for_good`` with it more than those of 150 steps.
+    With ``mapping`` surface newly mapped in its true place is the goal: neither standing still nor
+    getting lost earns any. The error terms penalize at once what would cost surface only later.
     """
     if not isinstance(weights, RewardConfig):
         value = weights(outcome)
@@ -158,6 +183,7 @@ def weighted_terms(
     return {
         "intensity_divergence": -weights.intensity_divergence * capped[..., 0],
         "depth_divergence": -weights.depth_divergence * targets.depth_weight * capped[..., 1],
+        "ate_growth": -weights.ate_growth * outcome.ate_growth_m,
         "trajectory_error": -weights.trajectory_error * growth,
         "new_surface": weights.new_surface * outcome.new_surface_m2,
         "lost": -weights.lost * np.logical_not(outcome.tracking_ok),

@@ -1,6 +1,7 @@
 """Options of a task: from its YAML file, before those of the command line."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -174,11 +175,11 @@ def test_the_size_of_the_images_is_that_of_the_environments_and_no_part_of_the_p
 
 
 def test_terms_of_the_reward_are_left_out_by_name():
-    args = parsed(["--without", "intensity_divergence", "lost", "--reward", "paper"])
-    weights = environments.problem_options(args, "train")["reward"]
-    assert weights["intensity_divergence"] == weights["lost"] == weights["new_surface"] == 0
-    assert (weights["depth_divergence"], weights["trajectory_error"]) == (0.5, 10.0)
-    environments.check_problem(args)
+    for reward in ("paper", "mapping", "default"):
+        args = parsed(["--without", "intensity_divergence", "lost", "--reward", reward])
+        whole = environments.make_env(replace(args, without=()), "train").unwrapped.config.reward
+        weights = environments.make_env(args, "train").unwrapped.config.reward
+        assert weights == replace(whole, intensity_divergence=0.0, lost=0.0)
     with pytest.raises(InputError, match=r"term of the reward 'los'.*lost_for_good"):
         parsed(["--without", "los"])
 

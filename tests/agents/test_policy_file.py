@@ -101,7 +101,7 @@ BROKEN = {
     "endless time": (as_bytes(words(minutes=1e400).replace("Infinity", "1e400")), "minutes = inf"),
     "more steps than there are": (as_bytes(words(timesteps=10**400)), "metadata: "),
     "an age of training": (as_bytes(words(minutes=1e300)), r"minutes = 1e\+300 is outside"),
-    "unknown algorithm": (as_bytes(words(algorithm="dqn")), "unknown algorithm 'dqn'"),
+    "unknown algorithm": (as_bytes(words(algorithm="sac")), "unknown algorithm 'sac'"),
     "module as environment": (as_bytes(words(env_id="evil:Env-v0")), "env_id 'evil:Env-v0' is not"),
     "module as observation": (as_bytes(words(observation="evil:Seen")), "observation 'evil:Seen'"),
     "other option": (as_bytes(words(env_options={"slam": "evil:Slam"})), "'slam'; valid"),

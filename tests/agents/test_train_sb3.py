@@ -8,13 +8,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("sb3_contrib")
 
 from learnable_fake import ENV_ID, LearnableFake, arguments, read_curve
 from ms_slam_agents import environments, evaluation, learning_curve, supervisor, train_sb3
+from ms_slam_agents.policy import Policy
 from ms_slam_agents.policy_file import read_policy, write_policy
-from ms_slam_agents.sb3_state import whole_batches
+from ms_slam_agents.sb3_state import tensors_of, whole_batches
 from scipy.stats import sem
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -267,6 +269,61 @@ def test_bars_count_reference_episodes_then_steps_or_seconds(tmp_path, capsys, m
     assert f"{3 * episodes} of {3 * episodes}" in shown
     assert "reference: greedy" in shown
     assert ends in shown.splitlines()[-1]
+
+
+DQN = ("--learning-starts", "64", "--train-every", "1", "--target-every", "50", "--save-every", "9")
+
+
+def test_dqn_learns_and_goes_on_where_it_was(tmp_path):
+    words = [*arguments(tmp_path, steps=1200, algorithm="dqn"), *DQN, "--learning-rate", "0.003"]
+    assert train_sb3.main([*words, "--eval-every", "400"]) == 0
+    curve, half = read_curve(tmp_path), read_policy(tmp_path / "latest.safetensors")
+    assert [point["timesteps"] for point in curve.points] == [0, 400, 800, 1200]
+    assert curve.points[-1]["return"] > 1.5 * curve.references["random walk"]["return"]
+    updates = half.tensors["optimizer.step"]
+    assert half.metadata.epochs == np.ceil(updates * half.metadata.options["batch_size"] / 1200)
+    assert train_sb3.main([*words, "--total-timesteps", "1300", "--resume"]) == 0
+    file = read_policy(tmp_path / "latest.safetensors")
+    assert file.metadata.timesteps == 1300
+    assert updates < file.tensors["optimizer.step"] <= updates + 100 - 64  # the replay filled first
+
+
+def test_dqn_that_has_not_begun_to_learn_says_so(tmp_path, capsys):
+    words = [*arguments(tmp_path, steps=60, algorithm="dqn"), *DQN]
+    assert train_sb3.main(words) == 1
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "nothing was learnt: 60 steps are not more than --learning-starts 64" in error
+
+
+def test_a_policy_file_of_dqn_holds_the_model(tmp_path):
+    """The same choices in NumPy as Stable-Baselines3 makes, and all of it is restored."""
+    words = [*arguments(tmp_path, steps=300, algorithm="dqn"), *DQN, "--no-references"]
+    assert train_sb3.main(words) == 0
+    file = read_policy(tmp_path / "latest.safetensors")
+    args = train_sb3.Args(
+        out=tmp_path, algorithm="dqn", env_id=ENV_ID, hidden=file.metadata.hidden[0], num_envs=1
+    )
+    model = train_sb3.make_model(args, environments.make_venv(args, "train"), file)
+    restored = tensors_of(model)
+    assert restored.keys() == file.tensors.keys()
+    assert any(name.startswith("target.") for name in restored)
+    for name, value in file.tensors.items():
+        np.testing.assert_array_equal(restored[name], value, err_msg=name)
+    seen = (10 * np.eye(7) + np.random.default_rng(0).normal(size=(7, 7))).astype(np.float32)
+    scaled = model.get_vec_normalize_env().normalize_obs(seen)
+    expected = model.predict(scaled, deterministic=True)[0]
+    found = Policy(file).probabilities(seen, np.ones((7, 7), bool))
+    np.testing.assert_array_equal(found.argmax(axis=1), expected)
+    with torch.no_grad():
+        best = model.q_net(torch.as_tensor(scaled)).numpy().argmax(axis=1)
+    np.testing.assert_array_equal(best, expected)
+    assert len(set(expected.tolist())) > 1
+
+
+def test_dqn_takes_one_number(tmp_path, capsys):
+    words = ["--algorithm", "dqn", "--env-id", "MSActiveSLAM-Adaptive-v0", "--num-envs", "1"]
+    assert train_sb3.main([*words, "--out", str(tmp_path / "run")]) == 2
+    assert "has actions of several numbers: use PPO" in capsys.readouterr().err
 
 
 def test_a_run_is_not_overwritten(run, capsys):

@@ -102,6 +102,19 @@ def run_beside(
     return seen
 
 
+def test_the_error_terms_of_a_batch_sum_to_the_final_ate() -> None:
+    env = batch_of(FREE, 2, **TWO)
+    env.reset(seed=0)
+    total, rng = np.zeros(2), np.random.default_rng(0)
+    for _ in range(6):
+        chances = rng.random((2, 49)) * env.action_masks()
+        *_, info = env.step(chances.argmax(axis=1))
+        total += info["reward_terms"]["ate_growth"]
+    assert (info["ate"] > 0).all()
+    np.testing.assert_allclose(total, -env.config.reward.ate_growth * info["ate"], rtol=1e-9)
+    env.close()
+
+
 @pytest.mark.parametrize("num_envs", [1, 4])
 def test_a_batch_does_what_each_environment_does_alone(num_envs: int) -> None:
     """Through ends of episodes, losses, blocked motions, and resets into other scenes."""

@@ -8,18 +8,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import ms_slam_env
 from ms_slam_env.camera import pinhole
 from ms_slam_env.env.coverage import CoverageGrid, Voxels
 from ms_slam_env.env.env_config import EnvConfig, RewardConfig, TargetConfig
+from ms_slam_env.env.make import options_for
+from ms_slam_env.env.planners import make_planner
 from ms_slam_env.env.reward import Outcome, reward_terms
 from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import make_pose, so3_exp, transform_points
+from ms_slam_env.gym_ids import MAX_EPISODE_STEPS
+from ms_slam_env.tasks import room
+
+FREE = "MSActiveSLAM-FreeCamera-v0"
 
 WEIGHTS = RewardConfig()
+MAPPING = RewardConfig.named()["mapping"]
 TARGETS = TargetConfig(M_I=0.02, M_D=0.04, rho_I=0.5, rho_D=0.25, depth_weight=3.0)
 ON_TARGET = Outcome(
     divergence=np.array([0.01, 0.01]),
     pose_error_growth_m=0.0,
+    ate_growth_m=0.0,
     new_surface_m2=0.0,
     tracking_ok=True,
     lost_for_good=False,
@@ -48,18 +57,20 @@ def test_divergence_terms_are_the_summands_of_line_9(delta_I, delta_D):
 
 
 @pytest.mark.parametrize(
-    ("change", "term", "sign"),
+    ("change", "term", "sign", "weights"),
     [
-        ({"pose_error_growth_m": 0.01}, "trajectory_error", -1),
-        ({"pose_error_growth_m": -0.01}, "trajectory_error", 1),
-        ({"new_surface_m2": 0.5}, "new_surface", 1),
-        ({"tracking_ok": False}, "lost", -1),
-        ({"lost_for_good": True}, "lost_for_good", -1),
-        ({"blocked": True}, "blocked", -1),
+        ({"ate_growth_m": 0.01}, "ate_growth", -1, WEIGHTS),
+        ({"ate_growth_m": -0.01}, "ate_growth", 1, WEIGHTS),
+        ({"pose_error_growth_m": 0.01}, "trajectory_error", -1, MAPPING),
+        ({"pose_error_growth_m": -0.01}, "trajectory_error", 1, MAPPING),
+        ({"new_surface_m2": 0.5}, "new_surface", 1, MAPPING),
+        ({"tracking_ok": False}, "lost", -1, WEIGHTS),
+        ({"lost_for_good": True}, "lost_for_good", -1, WEIGHTS),
+        ({"blocked": True}, "blocked", -1, WEIGHTS),
     ],
 )
-def test_each_outcome_moves_its_own_term(change, term, sign):
-    terms = reward_terms(dataclasses.replace(ON_TARGET, **change), WEIGHTS, TARGETS)
+def test_each_outcome_moves_its_own_term(change, term, sign, weights):
+    terms = reward_terms(dataclasses.replace(ON_TARGET, **change), weights, TARGETS)
     assert np.sign(terms.pop(term)) == sign
     assert set(terms.values()) == {0.0}
 
@@ -71,6 +82,7 @@ def test_the_papers_reward_is_divergence_and_trajectory_error_alone():
         ON_TARGET,
         divergence=np.array([0.03, 0.03]),
         pose_error_growth_m=0.02,
+        ate_growth_m=0.02,
         new_surface_m2=3.0,
         tracking_ok=False,
         lost_for_good=True,
@@ -78,13 +90,92 @@ def test_the_papers_reward_is_divergence_and_trajectory_error_alone():
         configuration_cost=1.0,
     )
     terms = reward_terms(bad, weights, TARGETS)
-    usual = reward_terms(bad, WEIGHTS, TARGETS)
+    usual = reward_terms(bad, MAPPING, TARGETS)
     asked = {"intensity_divergence", "depth_divergence", "trajectory_error"}
     assert {name for name, value in terms.items() if value} == asked
     assert all(terms[name] == usual[name] != 0 for name in asked)
     assert EnvConfig(reward="default").reward == EnvConfig().reward == WEIGHTS
-    with pytest.raises(InputError, match=r"unknown reward 'papers'; valid choices: .*paper"):
-        EnvConfig(reward="papers")
+    for wrong in ("papers", {"name": "papers"}):
+        with pytest.raises(InputError, match=r"unknown reward.* 'papers'; valid choices: .*paper"):
+            EnvConfig(reward=wrong)
+
+
+def test_environments_ask_for_divergence_and_error_and_tasks_for_a_map():
+    def weights(env_id, **options):
+        return gym.make(env_id, **options).unwrapped.config.reward
+
+    for env_id in (*ms_slam_env.ENV_IDS, *ms_slam_env.PERTURBED_ENV_IDS):
+        for chosen in ({}, {"reward": "default"}, {"reward": "divergence-and-error"}):
+            assert weights(env_id, **chosen) == WEIGHTS
+    for env_id in ms_slam_env.TASK_IDS:
+        for chosen in ({}, {"reward": "default"}, {"reward": "mapping"}):
+            assert weights(env_id, **chosen) == MAPPING
+        assert weights(env_id, reward="divergence-and-error") == WEIGHTS
+    assert weights(FREE, task="room") == MAPPING
+    assert RewardConfig(0.5, 0.5, 0.0, 10.0, 1.0, 0.5, 10.0, 0.1, 0.1) == MAPPING  # as in records
+
+
+@pytest.mark.parametrize(("env_id", "own"), [(FREE, WEIGHTS), ("MSActiveSLAM-Room-v0", MAPPING)])
+def test_weights_without_a_name_change_the_environments_own(env_id, own):
+    for chosen, expected in (
+        ({"lost": 2.0}, dataclasses.replace(own, lost=2.0)),
+        ({"name": "paper", "lost": 2.0}, RewardConfig(0.5, 0.5, 0, 10, 0, 2.0, 0, 0, 0)),
+    ):
+        assert gym.make(env_id, reward=chosen).unwrapped.config.reward == expected
+
+
+def test_a_task_can_have_a_reward_of_its_own():
+    task = dataclasses.replace(room(), options={"reward": {"new_surface": 3.0, "lost": 1.0}})
+    options = options_for(task, {"reward": {"lost": 2.0}})
+    assert EnvConfig(reward=options["reward"]).reward == RewardConfig(new_surface=3.0, lost=2.0)
+    paper = dataclasses.replace(room(), options={"reward": "paper"})
+    assert options_for(paper, {})["reward"] == "paper"
+    assert options_for(paper, {"reward": "mapping"})["reward"] == "mapping"
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options"), [(FREE, {"step_m": 0.3}), ("MSActiveSLAM-v0", {"pose": "kinematics"})]
+)
+def test_the_error_terms_of_an_episode_sum_to_its_final_ate(env_id, options):
+    """A camera that gets lost, and an arm whose every step has several frames."""
+    env = gym.make(env_id, scene_seed=1000, image_size="80x60", lost_patience=5, **options)
+    _, info = env.reset(seed=1)
+    total, rng = 0.0, np.random.default_rng(0)
+    for _ in range(12):
+        *_, terminated, _, info = env.step(rng.choice(np.flatnonzero(info["action_mask"])))
+        total += info["reward_terms"]["ate_growth"]
+        if terminated:
+            break
+    errors = [frame.pose_error for frame in env.unwrapped.episode.frames]
+    assert len(errors) > (60 if env_id == "MSActiveSLAM-v0" else 5)
+    assert info["ate"] > 1e-4
+    assert info["ate"] == pytest.approx(np.sqrt(np.mean(np.square(errors))))
+    assert total == pytest.approx(-WEIGHTS.ate_growth * info["ate"], rel=1e-9)
+
+
+def test_getting_lost_costs_more_than_it_saves():
+    """The largest distances of the steps that the end of a default episode saves."""
+    farthest = dataclasses.replace(ON_TARGET, divergence=np.array([9.0, 9.0]))
+    saved = -sum(reward_terms(farthest, WEIGHTS, TargetConfig()).values())
+    assert 0 < saved < WEIGHTS.lost
+    patience = EnvConfig().lost_patience
+    assert WEIGHTS.lost_for_good + patience * WEIGHTS.lost > MAX_EPISODE_STEPS * saved
+
+
+def test_standing_still_is_not_the_best_that_can_be_done():
+    """Divergences at rest miss their targets by more than the error of a moving camera costs."""
+
+    def earned(planner):
+        env = gym.make(FREE, scene_seed=1000, max_episode_steps=40)
+        observation, info = env.reset(seed=1000)
+        chosen, total, over = make_planner(planner, env.unwrapped, 0), 0.0, False
+        while not over:
+            action = chosen.act(observation, info)
+            observation, reward, terminated, truncated, info = env.step(action)
+            total, over = total + reward, terminated or truncated
+        return total
+
+    assert earned("random") < earned("stationary") < earned("greedy") < 0
 
 
 RAYS = pinhole("160x120").rays()

@@ -107,7 +107,7 @@ ENV_OPTIONS = {
     "step_rad": 0.1,
     "noise": "kinect",
     "pose": "slam",
-    "reward": {"ate": 1.0, "coverage": 1.0},
+    "reward": {"name": "mapping", "ate_growth": 1.0},
     "lookahead": {"stride": 4},
     "perturbed_by": "motion-blur",
     "perturbation": {"samples": 2},

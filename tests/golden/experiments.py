@@ -204,6 +204,14 @@ def step_size(_: Path) -> Any:
     return {f"{cm} cm": _episode("random", step_m=cm / 100, step_deg=cm) for cm in (3, 24)}
 
 
+@experiment("reward_shares")
+def reward_shares(_: Path) -> Any:
+    from ms_slam_experiments.reward_shares import RewardShares
+
+    (spec,) = RewardShares(planners=("random",), scenes=("carpet",), episodes=1, steps=3).specs()
+    return RewardShares.run(spec)
+
+
 @experiment("pose_sources")
 def pose_sources(_: Path) -> Any:
     options = {"embodiment": "arm-kinematic"}

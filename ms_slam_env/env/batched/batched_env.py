@@ -209,7 +209,7 @@ class BatchedActiveSlam(VectorEnv[Float32, Int64, Any]):
         moves = ~starts
         made = moves & self._masks[np.arange(self.num_envs), wanted]
         motions = np.where(made[:, None, None], self._motions[wanted], np.eye(4))
-        errors = self._episodes.pose_error.copy()
+        errors, ate = self._episodes.pose_error.copy(), self._episodes.ate
         self._episodes.move(moves, wanted, motions)
         self._look(starts, {})
         new_surface = self._track(starts)
@@ -217,6 +217,7 @@ class BatchedActiveSlam(VectorEnv[Float32, Int64, Any]):
         values: dict[str, Any] = {
             "divergence": self._episodes.divergence,
             "pose_error_growth_m": self._episodes.pose_error - errors,
+            "ate_growth_m": self._episodes.ate - ate,
             "new_surface_m2": new_surface,
             "tracking_ok": self._episodes.tracking_ok,
             "lost_for_good": lost_for_good,

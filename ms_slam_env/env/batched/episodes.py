@@ -97,6 +97,11 @@ class Episodes:
         """(B, 4, 4) the last estimated poses, relative to the starts."""
         return self._T_start_world @ self.T_world_camera_estimate
 
+    @property
+    def ate(self) -> Float64:
+        """(B,) RMSE of the positions over the episodes so far, metres, no alignment."""
+        return np.asarray(np.sqrt(self._squared_error_sum / (self.steps + 1)))
+
     def info(self) -> dict[str, Any]:
         """The episodes' entries of ``info``; the arrays are copies."""
         batch = len(self.steps)
@@ -105,7 +110,7 @@ class Episodes:
             "T_world_camera_estimate": self.T_world_camera_estimate,
             "pose_covariance": self._covariance,
             "pose_error": self.pose_error,
-            "ate": np.sqrt(self._squared_error_sum / (self.steps + 1)),
+            "ate": self.ate,
             "divergence": self.divergence,
             "tracking_ok": self.tracking_ok,
             "submap": np.zeros(batch, dtype=np.int64),
