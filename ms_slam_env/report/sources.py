@@ -43,6 +43,11 @@ PARTS: Mapping[str, tuple[str, ...]] = {
 Besides, every planner and every trained agent that a result names is a part, and its experiment.
 """
 
+PARTS_OF_SEQUENCES = (
+    *("geometry", "divergence", "scenes", "sensor", "SLAM", "surfel", "sequences", "metrics"),
+)
+"""What an experiment uses that runs SLAM over sequences."""
+
 _ONLY_IF_NAMED = {
     "sparse": r"\bsparse\b",
     "odometry": r"odometry|gicp|kiss_icp|semi.dense",
