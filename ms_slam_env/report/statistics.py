@@ -100,6 +100,18 @@ def share_interval(flags: ArrayLike) -> Interval:
     return Interval(float(array.mean()), float(interval.low), float(interval.high))
 
 
+def fisher_p(flags: ArrayLike, others: ArrayLike) -> float:
+    """Fisher's exact two-sided p of two samples of flags, (n,) and (m,).
+
+    The probability of counts that are no likelier than these, given their sum, if both samples have
+    the same share.
+    """
+    from scipy import stats
+
+    table = [[int(np.sum(of)), int(np.size(of) - np.sum(of))] for of in (flags, others)]
+    return float(stats.fisher_exact(table).pvalue)
+
+
 def rank_correlation(a: ArrayLike, b: ArrayLike) -> float:
     """Spearman's correlation of values (n,) and (n,); NaN if one of them is constant."""
     from scipy import stats

@@ -156,3 +156,12 @@ def test_a_correlation_over_groups_resamples_whole_groups() -> None:
     single = pooled_rank_correlation([(x[:1], y[:1]) for x, y in values])
     assert (copies.low, copies.high) == pytest.approx((single.low, single.high))
     assert np.isnan(pooled_rank_correlation([]).value)
+
+
+def test_fishers_test_is_the_sum_of_no_likelier_tables() -> None:
+    for a, b in ((2, 10), (5, 7), (4, 9), (0, 0)):
+        of = stats.hypergeom(20, a + b, 10)
+        chances = of.pmf(np.arange(11))
+        expected = chances[chances <= of.pmf(a) * (1 + 1e-9)].sum()
+        flags = [np.arange(10) < count for count in (a, b)]
+        assert statistics.fisher_p(*flags) == pytest.approx(expected)
