@@ -1,4 +1,4 @@
-# make install | test | benchmark | docs: each does all its own set-up in .venv; running again is instant.
+# make install | test | benchmark | check-results | docs: each does its set-up in .venv by itself.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 WORKERS ?= 2
 BIN := .venv/bin
@@ -15,7 +15,7 @@ CHECKED_TESTS := tests/slam/test_any_size.py tests/slam/test_fusion.py \
     tests/sensor/test_shading.py tests/divergence/test_batched_divergence.py \
     tests/planning/test_occupancy_grid.py tests/env/test_reward_and_coverage.py
 
-.PHONY: install test benchmark docs lint types clean
+.PHONY: install test benchmark check-results docs lint types clean
 
 install: $(STAMP)
 
@@ -53,6 +53,11 @@ benchmark: $(STAMP)
 	    --episodes 2 --workers $(WORKERS) --out results/benchmark
 	@echo "The report, for a browser:"
 	@$(BIN)/ms-slam report results/benchmark
+
+# The cheapest row of every committed record again; the same command goes on where it stopped.
+LIMIT_MINUTES ?= 60
+check-results: $(STAMP)
+	$(BIN)/ms-slam experiment check --limit-minutes $(LIMIT_MINUTES)
 
 # The tables of the Markdown pages from docs/results, then the site into site/.
 docs: $(STAMP)

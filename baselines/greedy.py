@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 PRESETS = ("environment", "paper")
-PAPER_LOOKAHEAD = LookaheadConfig(reference="live", scale=1.0)
+PAPER_LOOKAHEAD = LookaheadConfig(reference="live", scale=1.0, projection="exact")
 PAPER_TARGETS = TargetConfig(M_I=0.19, M_D=0.25, rho_I=1.0, rho_D=1.0, depth_weight=1.0)
 """M_I and M_D determined as for `TargetConfig`, but with the paper's histograms
 (``ms-slam experiment frame_skipping --histograms paper``). The paper gives no rho and no lambda: at
@@ -39,8 +39,9 @@ class GreedyDivergence(Planner):
         robot: the robot's view; its environment's targets are the defaults below.
         seed: unused; the planner is deterministic.
         preset: ``environment`` predicts, compares and aims as the environment is configured;
-            ``paper`` as Algorithm 1 is printed: views of full size against the last live frame,
-            256 bins of all pixels, not smoothed, and targets for this measure.
+            ``paper`` as Algorithm 1 is printed: the map projected for each candidate, at full size,
+            against the last live frame, 256 bins of all pixels, not smoothed, and targets for this
+            measure.
         rho_I: share of M_I to aim at, in [0, 1].
         rho_D: share of M_D to aim at, in [0, 1].
         depth_weight: lambda, significance of depth over intensity.

@@ -1,4 +1,4 @@
-"""Maximum information: look where the map is emptiest."""
+"""Most empty pixels: look where the map is emptiest."""
 
 from __future__ import annotations
 
@@ -15,6 +15,11 @@ class MaxInformation(Planner):
     The classical contrast to a divergence planner: next best view by expected gain, regardless of
     whether SLAM can follow. The gain of a view is its number of pixels for which the map predicts
     no depth: they show surface not yet seen, or nothing within the sensor's range.
+
+    This is a stand-in for the rivals that Saeedi et al. (ICRA 2017) cite, not their criterion,
+    which is the mutual information of map m and measurement z, I(m; z) = H(m) - E[H(m | z)], over
+    the cells of a probabilistic map: here a pixel counts the same whatever lies in it, and what a
+    nearer unknown surface would hide counts too.
     """
 
     motions_only = True

@@ -45,6 +45,7 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.geometry import invert, look_at, transform_points
 from ms_slam_env.report.charts import Chart, bars
 from ms_slam_env.report.figures import caption, new_figure, save
+from ms_slam_env.report.statistics import fisher_p
 from ms_slam_env.report.tables import Grouping, Row, Table, finished, make_table
 
 SCENES = ("window", "table", "wall", "carpet")
@@ -56,6 +57,7 @@ METRICS = (
 )
 LAMP = {"dim": 0.0, "lamp": 0.3, "speed_m_s": 0.001}  # "minor changes in illumination"
 ACTIVE, BASELINE = "greedy", "random"
+SHOWN_BELOW = 0.05  # p of a difference that counts as shown
 PAPER = {"carpet": f"{BASELINE} 0 of 10, {ACTIVE} 5 of 10"}
 """Successes stated in the paper's text; the others are only bars in its Fig. 8."""
 
@@ -189,8 +191,9 @@ class ArmExperiment(Experiment):
             "intervals, medians with 95 % bootstrap intervals."
         )
         medians = Grouping(("scene", "planner"), METRICS, count="episodes").table(rows, note=note)
-        columns = ["scene", f"{BASELINE}_successes", f"{ACTIVE}_successes", "better_planner"]
-        beside = make_table([*columns, "paper_claim"], compare(rows), "Beside the paper")
+        successes = [f"{planner}_successes" for planner in (BASELINE, ACTIVE)]
+        columns = ["scene", *successes, "fisher_p", "better_planner", "paper_claim"]
+        beside = make_table(columns, compare(rows), "Beside the paper")
         return [medians, beside]
 
     def charts(self, rows: Sequence[Row]) -> list[Chart]:
@@ -233,27 +236,31 @@ def _outcome(world: ActiveSlamEnv, judged: JudgedMap) -> dict[str, Any]:
     }
 
 
-def compare(rows: Sequence[Row]) -> list[dict[str, str | None]]:
-    """Successes of the greedy planner and of random walk by scene, and which has more.
+def compare(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Successes of the greedy planner and of random walk by scene, and which is shown to have more.
 
-    Ignores options of a planner; neither is better if one has no runs.
+    Ignores options of a planner; neither is better if one has no runs, or if Fisher's exact test of
+    the counts gives at least ``SHOWN_BELOW``.
     """
     flags: dict[tuple[str, str], list[bool]] = {}
     for row in finished(rows):
         key = row["spec"]["scene"], row["spec"]["planner"].partition(",")[0]
         flags.setdefault(key, []).append(bool(row["result"]["success"]))
-    lines = []
+    lines: list[dict[str, Any]] = []
     for scene in dict.fromkeys(scene for scene, _ in flags):
         runs = {planner: flags.get((scene, planner), []) for planner in (BASELINE, ACTIVE)}
-        line: dict[str, str | None] = {
+        line: dict[str, Any] = {
             f"{planner}_successes": f"{sum(of)} of {len(of)}" for planner, of in runs.items()
         }
-        better = None
+        better, p = None, None
         if all(runs.values()):
             random, greedy = (sum(of) / len(of) for of in runs.values())
-            better = BASELINE if random > greedy else ACTIVE if greedy > random else "equal"
+            p = fisher_p(*runs.values())
+            more = BASELINE if random > greedy else ACTIVE
+            better = more if p < SHOWN_BELOW else "not shown"
         claim = f"{ACTIVE} better" + (f": {PAPER[scene]}" if scene in PAPER else "")
-        lines.append({"scene": scene, **line, "better_planner": better, "paper_claim": claim})
+        result = {"fisher_p": p, "better_planner": better, "paper_claim": claim}
+        lines.append({"scene": scene, **line, **result})
     return lines
 
 

@@ -61,8 +61,13 @@ SETTINGS: dict[str, tuple[DivergenceConfig, LookaheadConfig]] = {
         _PAPER,
         LookaheadConfig(reference="live", scale=1.0),
     ),
+    "paper, each view projected": (
+        _PAPER,
+        LookaheadConfig(reference="live", scale=1.0, projection="exact"),
+    ),
     "paper, predicted reference": (_PAPER, LookaheadConfig(reference="predicted", scale=1.0)),
     "default": (DivergenceConfig(), LookaheadConfig()),
+    "default, each view projected": (DivergenceConfig(), LookaheadConfig(projection="exact")),
     "default, live reference": (DivergenceConfig(), LookaheadConfig(reference="live")),
     "default, predicted at full size": (DivergenceConfig(), LookaheadConfig(scale=1.0)),
     **{name: (measure, LookaheadConfig()) for name, measure in _MEASURES.items()},

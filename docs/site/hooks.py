@@ -132,7 +132,10 @@ def _results() -> Iterator[tuple[str, str]]:
         figures = "".join(f"![{p.stem}]({p.name})\n\n" for p in sorted(folder.glob("*.png")))
         page = f"# {result.title}\n\n{result.about}\n\n{result.as_markdown()}\n\n{figures}"
         pages.append((f"results/{name}/index.md", page))
-        age = f"version {result.version} of {RESULTS_VERSION}" if result.stale else "today"
+        age = "today"
+        if result.stale:
+            older = f"version {result.version} of {RESULTS_VERSION}"
+            age = f"before {', '.join(result.changed)}" if result.changed else older
         rows.append((f"[{name}](results/{name}/index.md)", result.title, age))
     listing = _table(["record", "what it shows", "made by the algorithms of"], rows)
     about = "What the experiments wrote, as it is committed in `docs/results`."

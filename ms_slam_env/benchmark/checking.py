@@ -4,32 +4,41 @@ from __future__ import annotations
 
 import math
 import re
+import time
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ms_slam_env.benchmark.command_runs import is_command
-from ms_slam_env.benchmark.experiment import Experiment
+from ms_slam_env.benchmark.experiment import EXPERIMENTS, Experiment, experiment_class
+from ms_slam_env.benchmark.rows import digest
 from ms_slam_env.config import from_dict
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, one_line
 from ms_slam_env.metrics.registry import metric
-from ms_slam_env.report.records import from_plain, to_plain
+from ms_slam_env.report.discovery import find_results
+from ms_slam_env.report.records import RecordFile, Row, from_plain, to_plain
 from ms_slam_env.report.results import Results
+from ms_slam_env.report.sources import sources_of
 from ms_slam_env.report.tables import finished
 
 TOLERANCE = 0.02
 """Relative difference expected between processors: amplified rounding of the last bits."""
 _SMALLEST = 1e-6
+_FEW = 10
+"""Counts below this must be equal; larger ones may differ by ``TOLERANCE``, and at least by one."""
 _OTHERS_CODE = re.compile(r"(?!ms_slam_(env|baselines|agents)\b)[A-Za-z_][\w.]*:[A-Za-z_]")
 """Matches ``module:Class``, but not a sequence ``scene:seed``, which has a digit there."""
 
 
-def check_results(cls: type[Experiment], committed: Results) -> tuple[int, list[str]]:
+def check_results(
+    cls: type[Experiment], committed: Results, rows: Sequence[Row] = ()
+) -> tuple[int, list[str]]:
     """Run some committed rows again; return their count and a line for each value that differs.
 
-    The rows are the cheapest for each value of the specification's first field (such as the
-    planner). Only metrics that the registry marks as repeatable are compared.
+    Without ``rows``, they are the cheapest for each value of the specification's first field (such
+    as the planner). Only metrics that the registry marks as repeatable are compared.
 
     Raises:
         InputError: no finished rows, results of another experiment, or rows that do not fit the
@@ -38,15 +47,15 @@ def check_results(cls: type[Experiment], committed: Results) -> tuple[int, list[
     name = cls.__module__.rpartition(".")[2]
     if committed.kind != name:
         raise InputError(f"the committed results are of {committed.kind!r}, not of {name!r}")
-    rows = sorted(finished(committed.rows), key=lambda row: row.get("elapsed_s", 0.0))
-    if not rows:
+    every = by_cost(committed)
+    if not every:
         raise InputError(f"the committed results of {name!r} hold no rows that could be run again")
     different: dict[str, Any] = {}
-    for row in rows:
+    for row in every:
         different.setdefault(str(next(iter(row["spec"].values()))), row)
     chosen = list(different.values())
-    chosen += [row for row in rows if row not in chosen]
-    chosen = chosen[: cls.check_rows]
+    chosen += [row for row in every if row not in chosen]
+    chosen = list(rows) or chosen[: cls.check_rows]
     for row in chosen:
         _check_is_ours(row["spec"])
     differences = []
@@ -56,6 +65,86 @@ def check_results(cls: type[Experiment], committed: Results) -> tuple[int, list[
         what = ", ".join(f"{key} {value}" for key, value in row["spec"].items())
         differences += [f"{what}: {text}" for text in compare(row["result"], again)]
     return len(chosen), differences
+
+
+def by_cost(committed: Results) -> list[Row]:
+    """Return the finished rows, the cheapest first."""
+    return sorted(finished(committed.rows), key=lambda row: row.get("elapsed_s", 0.0))
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What running the cheapest row of a record again has shown.
+
+    Attributes:
+        name: folder of the record.
+        outcome: ``same``, ``differs``, or ``not run``.
+        why: what differs, or why it was not run.
+        older: whether the record is marked as older than the code, so that it may differ.
+        seconds: time that it took.
+    """
+
+    name: str
+    outcome: str
+    why: str = ""
+    older: bool = False
+    seconds: float = 0.0
+
+
+def check_records(folder: Path, out: Path, limit_s: float, row_s: float) -> Iterator[Checked]:
+    """Run the cheapest row of every record again; cheap records come first.
+
+    What has been checked with the same record and the same code is read from ``out``, so that an
+    interrupted check goes on where it stopped.
+
+    Args:
+        folder: folder of the records.
+        out: folder of ``checked.jsonl``.
+        limit_s: stop running rows after so many seconds.
+        row_s: records whose cheapest row took longer are not run.
+    """
+    checked = RecordFile(out / "checked.jsonl")
+    before = checked.load()
+    found = [one for one in find_results(folder)[0] if one.results.rows]
+    costs = {one.path: by_cost(one.results)[0].get("elapsed_s", 0.0)
+             for one in found if by_cost(one.results)}  # fmt: skip
+    start = time.monotonic()
+    for path, cost in sorted(costs.items(), key=lambda item: item[1]):
+        results = next(one.results for one in found if one.path == path)
+        name = path.parent.relative_to(folder).as_posix()
+        text = str([results.content, [row["spec"] for row in results.rows]])
+        key = f"{name} {digest(path)} {sorted(sources_of(results.kind, text).items())}"
+        if key in before:
+            yield Checked(**before[key]["checked"])
+        elif results.kind not in EXPERIMENTS.own:
+            yield Checked(name, "not run", f"{results.kind} is no experiment")
+        elif cost > row_s:
+            yield Checked(name, "not run", f"its cheapest row took {cost:.0f} s")
+        elif time.monotonic() - start > limit_s:
+            yield Checked(name, "not run", "the time is up")
+        else:
+            one = _checked(name, results)
+            if one.outcome != "not run":
+                checked.append({"key": key, "checked": to_plain(one)})
+            yield one
+
+
+def _checked(name: str, results: Results) -> Checked:
+    """Run the cheapest row of a record again."""
+    start = time.monotonic()
+    differences: list[str] = []
+    older = bool(results.stale)
+    try:
+        cls = experiment_class(results.kind)
+        _, differences = check_results(cls, results, by_cost(results)[:1])
+    except InputError as error:  # such as data that is not at hand
+        return Checked(name, "not run", str(error), older)
+    except Exception as error:
+        differences = [f"{type(error).__name__}: {error}"]
+    why = ""
+    if differences:
+        why = one_line(f"{len(differences)} values, as {differences[0].rpartition(': ')[2]}")
+    return Checked(name, "differs" if why else "same", why, older, time.monotonic() - start)
 
 
 def _check_is_ours(spec: Mapping[str, Any]) -> None:
@@ -99,7 +188,8 @@ def compare(before: Any, after: Any, where: str = "") -> list[str]:
 def _alike(old: Any, new: Any) -> bool:
     is_number = not isinstance(old, bool) and isinstance(old, (int, float))
     if is_number and not isinstance(new, bool) and isinstance(new, (int, float)):
-        return math.isclose(old, new, rel_tol=TOLERANCE, abs_tol=_SMALLEST)
+        is_count = isinstance(old, int) and isinstance(new, int) and abs(old) >= _FEW
+        return math.isclose(old, new, rel_tol=TOLERANCE, abs_tol=1 if is_count else _SMALLEST)
     return bool(old == new)
 
 

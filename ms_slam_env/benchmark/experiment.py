@@ -37,6 +37,8 @@ class Experiment(ABC):
         tracks: whether rows are runs of a backend over a sequence; a run that is lost throughout is
             reported as a failure.
         check_rows: number of rows that ``--check`` runs again.
+        parts: parts of the code that the rows use (names of ``report.sources.PARTS``), if not all;
+            backends, planners and agents that a row names are added.
     """
 
     unit: ClassVar[str] = "runs"
@@ -45,6 +47,7 @@ class Experiment(ABC):
     fresh_process: ClassVar[bool] = False
     tracks: ClassVar[bool] = False
     check_rows: ClassVar[int] = 2
+    parts: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def specs(self) -> Sequence[Any]:

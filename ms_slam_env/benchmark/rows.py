@@ -29,6 +29,7 @@ from ms_slam_env.metrics.registry import RESULTS_VERSION, versions_since
 from ms_slam_env.report.provenance import git_commit
 from ms_slam_env.report.records import RecordFile, Row, from_plain, spec_key, to_plain
 from ms_slam_env.report.results import RESULTS, Results, write_result_folder
+from ms_slam_env.report.sources import joined, sources_of
 from ms_slam_env.report.tables import finished
 
 RECORDS = "rows.jsonl"
@@ -46,6 +47,7 @@ def run_all(
     fresh: bool = False,
     environment: Mapping[str, str] | None = None,
     kind: str = "",
+    parts: Sequence[str] = (),
 ) -> list[Row]:
     """Run every spec once, in parallel; return one row for each, in the order of ``specs``.
 
@@ -55,7 +57,8 @@ def run_all(
     algorithm that has changed since, and those that name a file whose content has changed. A row
     has ``key``, ``spec``, ``result`` (the return value of ``run``, None if it raised or its process
     died), ``error`` (None or the message), ``elapsed_s``, ``commit`` (of the code that made it),
-    ``results_version`` and ``files`` (hashes by name).
+    ``results_version``, ``sources`` (digests of the code that made it, by part) and ``files``
+    (hashes by name).
 
     Args:
         specs: dataclasses; all their fields together make the key of a row.
@@ -68,6 +71,7 @@ def run_all(
         environment: environment variables of the processes; None: one thread each, unless already
             set.
         kind: kind of the result, used to look up what has changed since a row was made.
+        parts: parts of the code that the rows use; none: all.
 
     Raises:
         InputError: fewer than one worker, no Ray or no cluster at the address, a folder that cannot
@@ -98,13 +102,15 @@ def run_all(
         by = f", {older} of them made by other code" if older else ""
         print(f"{description}: {done} of {len(set(keys))} already in {out}{by}", file=sys.stderr)
     if todo:
+        # Before the rows run, since files may be edited meanwhile.
+        sources = sources_of(kind, str([dataclasses.asdict(spec) for spec in specs]), parts)
         with Bar(total=len(set(keys)), initial=done, desc=description, unit="") as bar:
             name_of = names(
                 {key: dataclasses.asdict(spec) for key, spec in zip(keys, specs, strict=True)}
             )
 
             def finish(row: Row) -> None:
-                row |= {"commit": commit, "results_version": RESULTS_VERSION}
+                row |= {"commit": commit, "results_version": RESULTS_VERSION, "sources": sources}
                 row |= {"files": files[row["key"]]} if files[row["key"]] else {}
                 records.append(row)
                 rows[row["key"]] = row
@@ -238,6 +244,7 @@ def _run_specs(
         fresh=experiment.fresh_process,
         environment=experiment.environment(),
         kind=_kind(experiment),
+        parts=experiment.parts,
     )
     check_any_finished(rows)
     wrong = [*failures(rows), *(lost_runs(rows) if experiment.tracks else [])]
@@ -246,9 +253,11 @@ def _run_specs(
 
 def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results:
     """Write the results made from the rows into folder ``out``."""
-    # Left out: tracebacks hold local paths, the results have one version for all rows, and file
-    # hashes only decide whether a row must be made again.
-    left_out = ("traceback", "results_version", "files")
+    # Left out: tracebacks hold local paths, the results have one version and one set of digests for
+    # all rows, and file hashes only decide whether a row must be made again.
+    left_out = ("traceback", "results_version", "files", "sources")
+    known = [row["sources"] for row in rows if row.get("sources")]
+    sources = joined(known) if len(known) == len(rows) else {}
     rows = [{k: v for k, v in row.items() if k not in left_out} for row in rows]
     rows = from_plain(to_plain(rows))
     return write_result_folder(
@@ -262,6 +271,7 @@ def write_all(experiment: Experiment, rows: Sequence[Row], out: Path) -> Results
         rows=rows,
         rows_key=experiment.rows_key,
         content={"config": as_config(experiment), **experiment.content(rows)},
+        sources=sources,
     )
 
 

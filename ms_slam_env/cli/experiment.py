@@ -18,7 +18,7 @@ from ms_slam_env.benchmark import (
     experiment_class,
     run_experiment,
 )
-from ms_slam_env.benchmark.checking import check_results, committed_results
+from ms_slam_env.benchmark.checking import check_records, check_results, committed_results
 from ms_slam_env.benchmark.experiment import IN_A_CLONE
 from ms_slam_env.report.results import RESULTS, read_results
 
@@ -31,6 +31,8 @@ def main(arguments: Sequence[str]) -> int:
         print(listing())
         return 0 if arguments else 2
     name, *rest = arguments
+    if name == "check":
+        return check_all(parse(CheckArguments, rest, "ms-slam experiment check"))
     folder = Path("results") / name.replace(":", ".")
     return run(experiment_class(name), rest, f"ms-slam experiment {name}", folder)
 
@@ -55,6 +57,37 @@ def check(cls: type[Experiment], folder: Path) -> int:
     count, differences = check_results(cls, committed)
     print("\n".join(differences) or f"{folder}: {count} rows run again, nothing differs")
     return 1 if differences else 0
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckArguments:
+    """Run the cheapest row of every committed record again, and list those that differ.
+
+    Exit code 1 if a record differs that is not marked as older than the code. The same command
+    goes on where an interrupted one stopped, until the code or the record changes.
+    """
+
+    records: Path = Path("docs/results")
+    """Folder of the records."""
+    out: Path = Path("results/check")
+    """Folder that keeps what was checked."""
+    limit_minutes: float = 60.0
+    """Start no row after so many minutes."""
+    row_seconds: float = 30.0
+    """Leave out records whose cheapest row took longer when it was made."""
+
+
+def check_all(args: CheckArguments) -> int:
+    """Check every record; return 1 if one differs that is not marked as older than the code."""
+    counts: dict[str, int] = {}
+    args.out.mkdir(parents=True, exist_ok=True)
+    for one in check_records(args.records, args.out, 60 * args.limit_minutes, args.row_seconds):
+        label = f"{one.outcome}, as marked" if one.older and one.why else one.outcome
+        label = one.outcome if one.outcome == "not run" else label
+        counts[label] = counts.get(label, 0) + 1
+        print(f"{one.name}: {label}{f': {one.why}' if one.why else ''}", flush=True)
+    print("; ".join(f"{count} {label}" for label, count in sorted(counts.items())))
+    return 1 if counts.get("differs") else 0
 
 
 def with_run_options(cls: type[Experiment], out: Path) -> type[Any]:
@@ -90,6 +123,7 @@ def listing() -> str:
     return "\n".join(
         [
             "usage: ms-slam experiment NAME [options]; NAME --help lists the options",
+            "       ms-slam experiment check runs a row of every committed record again",
             "",
             *(f"  {name:<{width}}  {experiment_class(name).title()}" for name in names),
             *(() if HAS_RESEARCH else ("", ELSEWHERE)),

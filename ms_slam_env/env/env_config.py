@@ -64,10 +64,14 @@ class LookaheadConfig(Checked):
         reference: ``live`` compares with the last live frame, as Algorithm 1 does; ``predicted``
             compares with the view that the map predicts at the current pose.
         scale: size of the predicted views relative to the camera's image.
+        projection: ``warped`` renders the map once, from between the candidates, and warps this
+            view into theirs; ``exact`` projects the map for each of them, as Algorithm 1, line 5,
+            has it, in several times the time.
     """
 
     reference: str = chosen("predicted", "live", "predicted")
     scale: float = bounded(0.5, 0.125, 1)
+    projection: str = chosen("warped", "warped", "exact")
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,15 @@ class PredictsViews(Protocol):
     def predict(self, poses: Float64, scale: float = 1.0) -> Views:
         """Views from poses (N, 4, 4) at ``scale`` times the camera's size."""
 
+    def project(self, poses: Float64, scale: float = 1.0) -> Views:
+        """As ``predict``, each view rendered from the map itself."""
+
 
 class Lookahead:
     """Predicts the candidates' views, and their divergence from the current view.
 
     Args:
-        config: reference and scale.
+        config: reference, scale and projection.
         divergence: how divergence is measured.
         intrinsics: intrinsics of the live camera.
     """
@@ -39,7 +42,8 @@ class Lookahead:
 
     def predict(self, slam: PredictsViews, poses: Float64) -> Views:
         """Views of the map from ``poses`` (n, 4, 4), line 5."""
-        return slam.predict(poses, self.config.scale)
+        project = slam.project if self.config.projection == "exact" else slam.predict
+        return project(poses, self.config.scale)
 
     def divergences(
         self, slam: PredictsViews, poses: Float64, current_pose: Float64, live: RGBDFrame

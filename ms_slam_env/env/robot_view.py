@@ -161,6 +161,10 @@ class RobotView:
         """Views of the map from poses (N, 4, 4), of ``scale`` times the camera's size."""
         return self._env.slam.predict(poses, scale)
 
+    def project(self, poses: Float64, scale: float = 1.0) -> Views:
+        """As ``predict``, each view rendered from the map itself instead of from nearby views."""
+        return self._env.slam.project(poses, scale)
+
     def surface_points(self) -> Float64:
         """Points (M, 3) of the estimated surface, metres."""
         return self._env.slam.surface_points()

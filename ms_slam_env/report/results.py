@@ -34,7 +34,8 @@ from ms_slam_env.metrics.registry import (
 )
 from ms_slam_env.report.charts import Chart, chart_from_json
 from ms_slam_env.report.provenance import DIRTY, provenance
-from ms_slam_env.report.records import check_plain, from_plain, write_json
+from ms_slam_env.report.records import check_plain, from_plain, to_plain, write_json
+from ms_slam_env.report.sources import changed_parts, sources_of
 from ms_slam_env.report.tables import Table, table_from_json
 
 RESULTS = "results.json"
@@ -74,16 +75,24 @@ class Results:
     version: int = RESULTS_VERSION
 
     @property
+    def changed(self) -> list[str]:
+        """Parts whose code has changed since; empty for a result that does not record them."""
+        return changed_parts(self.provenance.get("sources", {}), self.kind)
+
+    @property
     def stale(self) -> str:
-        """A warning if older algorithms than the current ones made the result, otherwise empty."""
+        """A warning if other code than today's made the result, otherwise empty."""
+        changed = self.changed
         since = versions_since(self.version, self.kind)
-        if not since:
-            return ""
         newer = "; ".join(f"version {version}: {text}" for version, text in since.items())
-        return (
+        parts = [
+            f"These figures are older than the code of {', '.join(changed)}." if changed else "",
             f"These figures are older than the code (results version {self.version}, "
             f"{RESULTS_VERSIONS[self.version]}). Since then {newer}."
-        )
+            if since
+            else "",
+        ]
+        return " ".join(filter(None, parts))
 
     @property
     def uncommitted(self) -> str:
@@ -102,11 +111,12 @@ class Results:
     def short_caveats(self, page: Path, docs: Path) -> str:
         """The caveats as Markdown for a page; a link to ``docs`` leads to what has changed."""
         link = os.path.relpath(docs / "experiments.md", page.parent)
-        stale = (
-            f"Results version {self.version}, older than the code "
-            f"([changes]({link}#results-versions))."
-        )
-        return " ".join(filter(None, (stale if self.stale else "", self.uncommitted)))
+        if changed := self.changed:
+            what = f"Older than the code of {', '.join(changed)}"
+        else:
+            what = f"Results version {self.version}, older than the code"
+        stale = f"{what} ([changes]({link}#results-versions))." if self.stale else ""
+        return " ".join(filter(None, (stale, self.uncommitted)))
 
     def as_markdown(self) -> str:
         """The caveats, the tables, and their provenance, as Markdown."""
@@ -127,6 +137,7 @@ def write_results(
     rows_key: str = "rows",
     content: Mapping[str, Any] | None = None,
     metrics: Mapping[str, Any] | None = None,
+    sources: Mapping[str, str] | None = None,
 ) -> Results:
     """Write a result file, atomically.
 
@@ -141,6 +152,8 @@ def write_results(
         rows_key: key of the rows in the file.
         content: configuration and other entries, not checked.
         metrics: flat metrics of a single run, at the top level of the file.
+        sources: digests of the code that made it, by part; empty if unknown; by default of the code
+            of today.
 
     Raises:
         InputError: a result with a key that the registry does not know.
@@ -148,9 +161,10 @@ def write_results(
     check_keys(metrics or {})
     for row in rows:
         check_keys(row["result"] or {})
-    written = Results(
-        kind, title, about, tables, charts, rows, rows_key, content or {}, provenance()
-    )
+    if sources is None:
+        sources = sources_of(kind, str(to_plain([content, [row.get("spec") for row in rows]])))
+    made = {**provenance(), **({"sources": sources} if sources else {})}
+    written = Results(kind, title, about, tables, charts, rows, rows_key, content or {}, made)
     write_json(
         path,
         {
@@ -319,7 +333,10 @@ def _checked_version(version: Any) -> int:
 def _checked_provenance(given: Any) -> dict[str, Any]:
     check_plain("provenance", given, (dict,))
     check_plain("commit", given.get("commit"), (str, NoneType))
-    check_plain("versions", given.get("versions", {}), (dict,))
+    for key in ("versions", "sources"):
+        check_plain(key, given.get(key, {}), (dict,))
+    for digest in given.get("sources", {}).values():
+        check_plain("sources", digest, (str,))
     return dict(given)
 
 

@@ -18,6 +18,7 @@ from ms_slam_env._runtime.arrays import Float64
 
 CONFIDENCE = 0.95
 _PERCENTILES = (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE))
+_GROUP_RESAMPLES = 2000
 _RESAMPLES = 2000
 
 
@@ -99,6 +100,18 @@ def share_interval(flags: ArrayLike) -> Interval:
     return Interval(float(array.mean()), float(interval.low), float(interval.high))
 
 
+def fisher_p(flags: ArrayLike, others: ArrayLike) -> float:
+    """Fisher's exact two-sided p of two samples of flags, (n,) and (m,).
+
+    The probability of counts that are no likelier than these, given their sum, if both samples have
+    the same share.
+    """
+    from scipy import stats
+
+    table = [[int(np.sum(of)), int(np.size(of) - np.sum(of))] for of in (flags, others)]
+    return float(stats.fisher_exact(table).pvalue)
+
+
 def rank_correlation(a: ArrayLike, b: ArrayLike) -> float:
     """Spearman's correlation of values (n,) and (n,); NaN if one of them is constant."""
     from scipy import stats
@@ -106,6 +119,31 @@ def rank_correlation(a: ArrayLike, b: ArrayLike) -> float:
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return float("nan")
     return float(stats.spearmanr(a, b).statistic)
+
+
+def pooled_rank_correlation(groups: Sequence[tuple[ArrayLike, ArrayLike]]) -> Interval:
+    """Spearman's correlation over the pairs of all groups, with its bootstrap interval.
+
+    Whole groups are resampled, because the pairs of one are no independent samples.
+
+    Args:
+        groups: for each group, values (n,) and (n,).
+    """
+    pairs = [np.array(group, dtype=np.float64) for group in groups]  # (2, n) each
+    if not pairs:
+        return Interval(np.nan, np.nan, np.nan)
+    value = rank_correlation(*np.concatenate(pairs, axis=1))
+    rng = np.random.default_rng(0)
+    drawn = [
+        rank_correlation(*np.concatenate([pairs[k] for k in which], axis=1))
+        for which in rng.integers(len(pairs), size=(_GROUP_RESAMPLES, len(pairs)))
+    ]
+    known = [one for one in drawn if np.isfinite(one)]
+    if not known:
+        return Interval(value, np.nan, np.nan)
+    tail = 50 * (1 - CONFIDENCE)
+    low, high = np.percentile(known, [tail, 100 - tail])
+    return Interval(value, float(low), float(high))
 
 
 def interquartile_mean(scores: Float64) -> Float64:

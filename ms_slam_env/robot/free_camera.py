@@ -143,6 +143,10 @@ class FixedTranslation(Embodiment):
         directions = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
         self._direction = max(directions, key=self._free_steps)
 
+    def steps_ahead(self, most: int = 100) -> int:
+        """Steps along the line, at most ``most``, before it reverses."""
+        return self._free_steps(self._direction, most)
+
     def _free_steps(self, direction: Float64, most: int = 100) -> int:
         position = self.T_world_camera[:3, 3]
         for steps in range(most):

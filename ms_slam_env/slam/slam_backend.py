@@ -181,6 +181,13 @@ class SlamBackend(Stateful):
         If there are several submaps: the current one and all that are joined to it.
         """
 
+    def project(self, poses: ArrayLike, scale: float = 1.0) -> Views:
+        """Render each view from the map itself; see ``predict``.
+
+        The same as ``predict`` for a backend that does so anyway.
+        """
+        return self.predict(poses, scale)
+
     @abstractmethod
     def surface_points(self) -> Float64:
         """Points (M, 3) of the estimated surface in the world frame, metres.
@@ -371,6 +378,10 @@ class BorrowedMap(SlamBackend):
     def predict(self, poses: ArrayLike, scale: float = 1.0) -> Views:
         """Render the surface from ``poses`` (N, 4, 4) T_world_camera; see ``SlamBackend``."""
         return self._mapper.predict(poses, scale)
+
+    def project(self, poses: ArrayLike, scale: float = 1.0) -> Views:
+        """Render each view from the surface itself; see ``SlamBackend``."""
+        return self._mapper.project(poses, scale)
 
     def surface_points(self) -> Float64:
         """Points (M, 3) of the surface in the world frame, metres."""

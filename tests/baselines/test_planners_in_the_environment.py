@@ -1,5 +1,6 @@
 """The planners in the real environment: valid motions, the criterion met, reproducible."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -11,6 +12,7 @@ from ms_slam_baselines.greedy import PAPER_TARGETS
 import ms_slam_env  # noqa: F401 -- registers the environments
 from ms_slam_env.divergence import depth_divergence, intensity_divergence
 from ms_slam_env.env.env_config import TargetConfig
+from ms_slam_env.env.lookahead import Lookahead
 from ms_slam_env.env.planners import make_planner
 from ms_slam_env.errors import InputError
 
@@ -59,7 +61,7 @@ def test_the_papers_greedy_is_algorithm_1_with_the_public_divergences(env):
     planner = GreedyDivergence(world, preset="paper", depth_weight=0.5)
     live, targets = world.episode.last_frame, PAPER_TARGETS
     best, smallest = -1, np.inf
-    views = world.slam.predict(world.candidate_poses(), 1.0)
+    views = world.slam.project(world.candidate_poses(), 1.0)
     for i in np.flatnonzero(info["action_mask"]):
         predicted_I = np.floor(views.intensity[i] + 0.5).astype(np.uint8)
         delta_I = intensity_divergence(predicted_I, live)
@@ -69,6 +71,24 @@ def test_the_papers_greedy_is_algorithm_1_with_the_public_divergences(env):
             best, smallest = i, distance
     assert planner.act(observation, info) == best
     assert planner.targets.M_I != world.config.targets.M_I
+
+
+def test_an_exact_lookahead_projects_the_map_for_each_candidate(env):
+    """Its divergences are those of views rendered one at a time; the default's differ."""
+    env.reset(seed=1)
+    env.step(1)
+    world = env.unwrapped
+    here, poses = world.episode.T_world_camera_estimate, world.candidate_poses()
+    config = replace(world.config.lookahead, projection="exact")
+    lookahead = Lookahead(config, world.config.divergence, world.intrinsics)
+    found = lookahead.divergences(world.slam, poses, here, world.episode.last_frame)
+    reference = world.slam.project(here[None], config.scale)
+    measure = lookahead.measure
+    for i in (0, 3, 6):
+        one = world.slam.project(poses[i : i + 1], config.scale)
+        both = [measure.histograms(v.intensity, v.depth, v.normals) for v in (one, reference)]
+        np.testing.assert_allclose(found[i], measure.divergence(*both)[0], rtol=1e-6, atol=1e-9)
+    assert not np.array_equal(found, world.lookahead())
 
 
 def test_greedy_names_its_presets():

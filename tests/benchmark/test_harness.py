@@ -5,14 +5,16 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from ms_slam_env.benchmark import EXPERIMENTS, Experiment, experiment_class, rows
+from ms_slam_env.benchmark import EXPERIMENTS, Experiment, checking, experiment_class, rows
 from ms_slam_env.benchmark.checking import check_results, compare, spec_type
 from ms_slam_env.benchmark.rows import run_experiment
 from ms_slam_env.benchmark.usme import Usme
@@ -177,6 +179,43 @@ def test_a_check_finds_what_changed(
     assert "cpu_ms" not in "".join(found)
 
 
+def test_every_record_is_checked_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    records, out = tmp_path / "records", tmp_path / "check"
+    for name in ("right", "wrong", "older"):
+        run_experiment(Wobbles(), records / name, workers=1)
+    for name in ("wrong", "older"):
+        path = records / name / "results.json"
+        content = json.loads(path.read_text())
+        cheapest = min(content["rows"], key=lambda row: row["elapsed_s"])
+        cheapest["result"]["ate_m"] *= 2
+        if name == "older":
+            content["provenance"]["sources"]["divergence"] = "0" * 12
+        path.write_text(json.dumps(content))
+    own = Wobbles.__module__.rpartition(".")[2]
+    command = ["experiment", "check", "--records", str(records), "--out", str(out)]
+    assert main(command) == 0
+    assert f"right: not run: {own} is no experiment" in capsys.readouterr().out
+    monkeypatch.setattr(checking, "EXPERIMENTS", SimpleNamespace(own=(own,)))
+    monkeypatch.setattr(checking, "experiment_class", lambda name: Wobbles)
+    assert main([*command, "--row-seconds", "-1"]) == 0
+    assert "its cheapest row took" in capsys.readouterr().out
+    assert main([*command, "--limit-minutes", "-1"]) == 0
+    assert "not run: the time is up" in capsys.readouterr().out
+    assert main(command) == 1
+    said = capsys.readouterr().out
+    assert "right: same\n" in said
+    assert re.search(
+        r"^wrong: differs: 1 values, as ate_m was 0.0\d, is 0.0\d$", said, re.MULTILINE
+    )
+    assert "older: differs, as marked: 1 values" in said
+    assert said.endswith("1 differs; 1 differs, as marked; 1 same\n")
+    monkeypatch.setattr(Wobbles, "run", staticmethod(lambda spec: pytest.fail("again")))
+    assert main(command) == 1  # from what is kept
+    assert capsys.readouterr().out == said
+
+
 def test_results_are_compared_to_their_depth() -> None:
     old = {"closures": [{"before_m": 1.0, "after_m": 0.1}], "lost": True}
     assert compare(old, {"closures": [{"before_m": 1.001, "after_m": 0.1}], "lost": True}) == []
@@ -186,6 +225,8 @@ def test_results_are_compared_to_their_depth() -> None:
     assert compare({"map_points": 18314}, {"map_points": 18313}) == []  # as much as 2 % may differ
     assert compare({"map_points": 18314}, {"map_points": 17314})
     assert compare({"losses": 1}, {"losses": 2})
+    assert compare({"losses": 20}, {"losses": 21}) == []  # many: at least by one
+    assert compare({"losses": 20}, {"losses": 22})
 
 
 def test_unknown_keys_are_refused_at_any_depth() -> None:

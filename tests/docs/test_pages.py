@@ -63,7 +63,7 @@ def test_commands_of_a_page_exist(page: Path) -> None:
     assert used <= set(COMMANDS)
     named = re.findall(r"ms-slam experiment (\w+)(?![\w:])", text)
     experiments = {name.replace("-", "_") for name in named}
-    assert experiments <= {*EXPERIMENTS.own, "list", "NAME"}
+    assert experiments <= {*EXPERIMENTS.own, "list", "check", "NAME"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

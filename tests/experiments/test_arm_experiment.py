@@ -74,10 +74,15 @@ ROWS = [
 
 def test_the_comparison_names_the_better_planner() -> None:
     better = {line["scene"]: line["better_planner"] for line in compare(ROWS)}
-    assert better == {"carpet": "greedy", "wall": "equal", "table": None}
+    assert better == {"carpet": "greedy", "wall": "not shown", "table": None}
     text = ArmExperiment().tables(ROWS)[1].as_markdown()
-    line = "| carpet | 0 of 10 | 5 of 10 | greedy | greedy better: random 0 of 10, greedy 5 of 10 |"
+    line = "| carpet | 0 of 10 | 5 of 10 | 0.033 | greedy | greedy better: random 0 of 10, greedy 5"
     assert line in text
+    few = [*(row("wall", "random", k < 5) for k in range(10)),
+           *(row("wall", "greedy", k < 7) for k in range(10))]  # fmt: skip
+    (line_of_few,) = compare(few)
+    assert line_of_few["better_planner"] == "not shown"
+    assert line_of_few["fisher_p"] == pytest.approx(0.65, abs=0.005)
 
 
 def test_a_map_without_objects_has_no_share_and_the_chart_no_bar() -> None:

@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 
 from ms_slam_env.report import statistics
-from ms_slam_env.report.statistics import Interval
+from ms_slam_env.report.statistics import Interval, pooled_rank_correlation
 
 SCORES = st.floats(-1e3, 1e3)
 
@@ -140,3 +140,28 @@ def test_policies_are_resampled_as_a_binomial_distribution_says(
     expected = stats.binom.ppf([0.025, 0.975], policies, better / policies) / policies
     assert found.value == pytest.approx(better / policies)
     assert (found.low, found.high) == pytest.approx(expected, abs=1 / policies + 1e-9)
+
+
+def test_a_correlation_over_groups_resamples_whole_groups() -> None:
+    rng = np.random.default_rng(3)
+    values = [(rng.normal(size=5), rng.normal(size=5)) for _ in range(8)]
+    found = pooled_rank_correlation(values)
+    a, b = (np.concatenate(part) for part in zip(*values, strict=True))
+    assert found.value == pytest.approx(stats.spearmanr(a, b).statistic)
+    assert found.low < found.value < found.high
+    # Copies of one pair in each group add no information, but would to a bootstrap over pairs.
+    copies = pooled_rank_correlation(
+        [(np.repeat(x[:1], 9), np.repeat(y[:1], 9)) for x, y in values]
+    )
+    single = pooled_rank_correlation([(x[:1], y[:1]) for x, y in values])
+    assert (copies.low, copies.high) == pytest.approx((single.low, single.high))
+    assert np.isnan(pooled_rank_correlation([]).value)
+
+
+def test_fishers_test_is_the_sum_of_no_likelier_tables() -> None:
+    for a, b in ((2, 10), (5, 7), (4, 9), (0, 0)):
+        of = stats.hypergeom(20, a + b, 10)
+        chances = of.pmf(np.arange(11))
+        expected = chances[chances <= of.pmf(a) * (1 + 1e-9)].sum()
+        flags = [np.arange(10) < count for count in (a, b)]
+        assert statistics.fisher_p(*flags) == pytest.approx(expected)

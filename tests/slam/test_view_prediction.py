@@ -192,3 +192,20 @@ def test_nothing_is_written_behind_the_last_view():
     written = keys.numpy() != int(EMPTY)
     assert written[:size].any()
     assert not written[size:].any()
+
+
+def test_projected_views_are_the_map_splatted_into_each(wide_map: SurfelMap) -> None:
+    """Bit for bit, unlike views warped from one: the map rendered at each pose on its own."""
+    views = wide_map.predict(CANDIDATES, singly=True)
+    for pose, depth, intensity, normals in zip(
+        CANDIDATES, views.depth, views.intensity, views.normals, strict=True
+    ):
+        direct = wide_map.render_model(device_poses(pose[None]))
+        np.testing.assert_array_equal(depth, direct.vertices.numpy()[0, ..., 2])
+        np.testing.assert_array_equal(intensity, direct.intensity.numpy()[0])
+        np.testing.assert_array_equal(normals, direct.normals.numpy()[0])
+    warped = wide_map.predict(CANDIDATES)
+    true_depth = np.stack([ray_cast(pose, SMALL)[0] for pose in CANDIDATES])
+    near_truth = [np.abs(each.depth - true_depth) < 0.002 for each in (views, warped)]
+    assert near_truth[0].mean() > 0.9
+    assert not np.array_equal(views.depth, warped.depth)

@@ -116,6 +116,10 @@ class SurfelSlam(SlamBackend):
         """Render the map from ``poses`` (N, 4, 4) T_world_camera at ``scale`` times image size."""
         return self.map.predict(check_views(poses, scale), scale)
 
+    def project(self, poses: ArrayLike, scale: float = 1.0) -> Views:
+        """As ``predict``, with all surfels splatted into every view instead of one view warped."""
+        return self.map.predict(check_views(poses, scale), scale, singly=True)
+
     def surface_points(self) -> Float64:
         """Positions (M, 3) of all living surfels: stable ones, and young ones seen recently.
 

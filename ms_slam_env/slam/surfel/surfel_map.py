@@ -470,7 +470,7 @@ class SurfelMap(Stateful):
         return self.kernels.render_model(poses)
 
     def predict_device(
-        self, poses: ArrayLike, scale: float = 1.0, first_env: int = 0
+        self, poses: ArrayLike, scale: float = 1.0, first_env: int = 0, singly: bool = False
     ) -> DeviceViews:
         """Predict views of the maps, left on the device.
 
@@ -478,16 +478,20 @@ class SurfelMap(Stateful):
             poses: (E, N, 4, 4) T_world_camera of N views for each of E envs.
             scale: size of the predicted images relative to the live ones.
             first_env: index of the first of the E envs.
+            singly: whether to splat the map into every view instead of warping one.
 
         Returns:
             Images (E * N, h, w), overwritten by the next call.
         """
-        return self._predictor.predict(np.asarray(poses, dtype=np.float64), scale, first_env)
+        stack = np.asarray(poses, dtype=np.float64)
+        return self._predictor.predict(stack, scale, first_env, singly)
 
-    def predict(self, poses: ArrayLike, scale: float = 1.0, env: int = 0) -> Views:
+    def predict(
+        self, poses: ArrayLike, scale: float = 1.0, env: int = 0, singly: bool = False
+    ) -> Views:
         """Predict views (N) of one env's map from ``poses`` (N, 4, 4) T_world_camera."""
         stack = np.asarray(poses, dtype=np.float64).reshape(1, -1, 4, 4)
-        views = self.predict_device(stack, scale, env)
+        views = self.predict_device(stack, scale, env, singly)
         return Views(
             intensity=views.intensity.numpy().copy(),
             depth=views.depth.numpy().copy(),

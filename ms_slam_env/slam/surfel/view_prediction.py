@@ -315,8 +315,13 @@ class ViewPredictor:
         self._single: dict[tuple[int, Intrinsics], SplatRenderer] = {}
         self._outputs: dict[tuple[int, Intrinsics], tuple[wp.array, DeviceViews]] = {}
 
-    def predict(self, poses: Float64, scale: float, first_env: int) -> DeviceViews:
-        """Images (E * N, h, w) from ``poses`` (E, N, 4, 4) of E envs, the first ``first_env``."""
+    def predict(
+        self, poses: Float64, scale: float, first_env: int, singly: bool = False
+    ) -> DeviceViews:
+        """Images (E * N, h, w) from ``poses`` (E, N, 4, 4) of E envs, the first ``first_env``.
+
+        With ``singly``, all surfels are splatted into every view.
+        """
         if poses.ndim != 4 or poses.shape[2:] != (4, 4) or 0 in poses.shape:
             raise InputError(f"poses must be (envs, views, 4, 4), got {poses.shape}")
         if not np.isfinite(poses).all():
@@ -326,11 +331,14 @@ class ViewPredictor:
         envs, count = poses.shape[:2]
         intrinsics = self.intrinsics.scaled(scale)
         keys, views = self._buffers(envs * count, intrinsics)
+        if singly:
+            self._predict_singly(poses, views, first_env, math.inf)
+            return views
         references = np.stack([mean_pose(poses[e]) for e in range(envs)])
         motions = invert(references)[:, None] @ poses
         wide = wide_intrinsics(intrinsics, motions.reshape(-1, 4, 4))
         if wide is None:
-            self._predict_singly(poses, views, first_env)
+            self._predict_singly(poses, views, first_env, LAYERS)
             return views
         reference = self._reference(envs, wide)
         reference.render(self._upload(references), first_env)
@@ -352,11 +360,13 @@ class ViewPredictor:
         pieces = (total, views.intrinsics.height, threads)
         wp.launch(resolve_views, pieces, [*shared, keys, columns, *images], device=self.device)
 
-    def _predict_singly(self, poses: Float64, views: DeviceViews, first_env: int) -> None:
+    def _predict_singly(
+        self, poses: Float64, views: DeviceViews, first_env: int, layers: float
+    ) -> None:
         """Splat the surfels themselves into every view, one view per env at a time.
 
         From far away, or in small images, there are dozens of surfels per pixel, so they are
-        thinned.
+        thinned to about ``layers`` surfaces.
         """
         envs, count = poses.shape[:2]
         key = (envs, views.intrinsics)
@@ -364,7 +374,7 @@ class ViewPredictor:
             self._single[key] = self._renderer(envs, views.intrinsics)
         renderer = self._single[key]
         for n in range(count):
-            renderer.cull(self._upload(poses[:, n]), first_env, layers=LAYERS)
+            renderer.cull(self._upload(poses[:, n]), first_env, layers=layers)
             image = renderer.splat(first_env)
             drawn = [image.vertices, image.normals, image.intensity]
             inputs = [*drawn, count, n, views.intensity, views.depth, views.normals]
