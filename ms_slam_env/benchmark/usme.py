@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 
 from ms_slam_env import metrics, scenes, slam
 from ms_slam_env._runtime.arrays import Float64
@@ -39,18 +38,34 @@ TABLES: Mapping[str, tuple[str, ...]] = {
         *("end_error_m", "end_error_share", "rpe_m", "rpe_rad"),
     ),
     "Map": (
-        *("map_points", "c2c_mean_m", "c2c_std_m", "hausdorff_directed_m", "recall_near"),
+        *(
+            "tracked_share",
+            "map_points",
+            "c2c_mean_m",
+            "c2c_std_m",
+            "hausdorff_directed_m",
+            "recall_near",
+        ),
         *("noise_ratio", "spacing_m"),
     ),
     "Robustness": (
-        *("lost_share", "robustness", "relocalisation_s", "initialisation_s", "scale_error"),
+        *("lost_share", "tracked_pieces", "robustness", "relocalisation_s"),
+        *("initialisation_s", "scale_error"),
     ),
     "Loops": (
-        *("revisits", "revisiting_frames", "stated_loops", "closed_loops"),
+        *("tracked_share", "revisits", "revisiting_frames", "stated_loops", "closed_loops"),
         *("loop_precision", "loop_recall"),
     ),
     "Cost": (
-        *("frames", "ext_ms", "ext_ms_p95", "cpu_ms_mean", "mem_peak_mb", "ene_frame_j"),
+        *(
+            "frames",
+            "tracked_share",
+            "ext_ms",
+            "ext_ms_p95",
+            "cpu_ms_mean",
+            "mem_peak_mb",
+            "ene_frame_j",
+        ),
         *("ene_source", "ene_model_frame_j", "energy_source"),
     ),
 }
@@ -270,7 +285,8 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
 
     Returns:
         metrics by key, None where a metric does not apply or cannot be computed. Accuracy: USME
-        equations 1 to 5, the last pose's error relative to the path length, the poses of the
+        equations 1 to 5, the last pose's error relative to the path length (None if the last frame
+        was lost: a pose held since the start would be right where a loop ends), the poses of the
         finished map. Map, after outlier removal (6) and ICP: distances, ``hausdorff_directed_m``
         (7, spurious points of the map), ``recall_near``, ``noise_ratio`` (8). Robustness (9 to 11,
         infinite: never relocalised) and, for a backend that closes loops, all of ``loop_measures``.
@@ -295,7 +311,8 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
     tracked, seconds = run.tracking_ok, np.array(run.timestamps)
     ate = metrics.ate_statistics(poses, truth)
     start = metrics.initialisation(seconds, poses, truth, global_scale=1.0)
-    end_error = float(np.linalg.norm(poses[-1, :3, 3] - truth[-1, :3, 3]))
+    end_error = float(np.linalg.norm(poses[-1, :3, 3] - truth[-1, :3, 3])) if tracked[-1] else None
+    robustness = metrics.tracking_robustness(poses, truth, tracked)
     path = metrics.path_length(truth)
     surface = _seen_surface(scene, sequence.poses, options)
     loops: dict[str, Any] = {}
@@ -310,12 +327,13 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
         **metrics.tracked_errors(poses, truth, tracked),
         "ate_max_m": ate.max,
         "end_error_m": end_error,
-        "end_error_share": end_error / path,
+        "end_error_share": None if end_error is None else end_error / path,
         "rpe_m": metrics.rpe_rmse(poses, truth),
         "rpe_rad": metrics.rpe_rmse(poses, truth, kind="rotation"),
         "final_ate_m": _final_ate(run, truth),
         "lost_share": run.lost,
-        "robustness": _robustness(poses, truth, tracked),
+        "tracked_pieces": len(robustness.segments),
+        "robustness": robustness.error,
         "relocalisation_s": metrics.mean_relocalisation_time(
             seconds, np.array(black), run.anchored
         ),
@@ -384,12 +402,6 @@ def _frames(sequence: RenderedSequence, folder: str | None) -> Iterator[RGBDFram
 def _final_ate(run: SequenceRun, truth: Float64) -> float | None:
     corrected = run.corrected()
     return None if corrected is None else metrics.ate_rmse(corrected, truth)
-
-
-def _robustness(poses: Float64, truth: Float64, tracked: NDArray[np.bool_]) -> float | None:
-    if not len(metrics.tracked_segments(tracked)):
-        return None
-    return metrics.tracking_robustness(poses, truth, tracked).error
 
 
 def _seen_surface(scene: Scene, poses: Float64, options: dict[str, Any]) -> Float64:

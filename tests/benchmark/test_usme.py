@@ -2,6 +2,7 @@
 
 import json
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from ms_slam_env.benchmark import usme
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.sequences.usme_suite import NAMES, find
+from ms_slam_env.slam.slam_backend import TrackResult
 
 make_scene = cache(scenes.make)
 
@@ -43,7 +45,7 @@ def test_one_run_has_every_measure():
     assert 0.0 <= result["lost_share"] <= 1.0
     assert not np.isnan(result["relocalisation_s"])
     assert result["ate_m"] <= result["ate_max_m"]
-    assert result["end_error_share"] == pytest.approx(result["end_error_m"] / result["path_m"])
+    assert result["tracked_pieces"] >= 1
     assert 0.0 <= result["noise_ratio"] < 1.0
     assert result["hausdorff_directed_m"] >= result["c2c_mean_m"] > 0.0
     assert result["ene_source"]
@@ -61,6 +63,44 @@ def test_one_run_has_every_measure():
     closes_none = usme.Usme().tables([{**row, "result": result, "error": None}])
     assert [len(table.rows) for table in closes_none] == [1, 1, 1, 1, 0, 1]
     assert tables[0].rows[0]["about"] == "the same with a run of black frames"
+
+
+@pytest.mark.usefixtures("cheap")
+@pytest.mark.parametrize("tracked", [None, 6])
+def test_a_system_lost_for_good_has_no_good_values(tracked, monkeypatch):
+    def make(name, intrinsics, **params):
+        system = slam.make(name, intrinsics, **params)
+        track, results = system.track, []
+
+        def lost_after(frame):
+            if tracked is None or len(results) < tracked:
+                results.append(track(frame))
+                return results[-1]
+            return TrackResult(results[-1].T_world_camera, False)
+
+        system.track = lost_after
+        return system
+
+    monkeypatch.setattr(usme, "slam", SimpleNamespace(make=make))
+    spec = usme.UsmeSpec("room-fast", "odometry", "80x60", SEED, frames_scale=0.3)
+    monkeypatch.setattr(
+        usme, "_frames", lambda sequence, _: (sequence.frames[k] for k in range(20))
+    )
+    render = usme.render
+    monkeypatch.setattr(usme, "render", lambda *a: render(*a).picked(np.arange(20)))
+    result = usme.run_usme(spec)
+    if tracked is None:
+        assert (result["tracked_pieces"], result["robustness"], result["lost_share"]) == (1, 0, 0)
+        assert result["end_error_share"] == pytest.approx(result["end_error_m"] / result["path_m"])
+        return
+    assert result["lost_share"] == pytest.approx(1 - tracked / 20)
+    assert result["tracked_pieces"] == 1
+    for key in ("robustness", "end_error_m", "end_error_share"):
+        assert result[key] is None, key
+    row = {"spec": {"sequence": "room-fast", "backend": "odometry"}, "result": result}
+    for table in usme.Usme().tables([{**row, "error": None}])[1:]:
+        names = {column.name for column in table.columns}
+        assert names & {"tracked_share", "lost_share"}, table.title
 
 
 def test_a_map_against_itself_is_without_error():

@@ -289,10 +289,51 @@ def test_frames_that_a_run_lost_are_gaps(tmp_path: Path) -> None:
     assert result["poses"] == COUNT - 4
     assert result["tracked_share"] == everything["tracked_share"] == pytest.approx(1 - 4 / COUNT)
     assert result["ate_max_m"] < 1e-6
-    robustness = result
-    assert (robustness["gaps"], robustness["tracked_pieces"]) == (2, 3)
-    assert robustness["lost_s"] == pytest.approx(4 * 0.05 + 2 * 0.05)
-    assert robustness["robustness"] == pytest.approx(0, abs=1e-6)
+    for robustness in (result, everything):  # beside the estimate it needs no option
+        assert (robustness["gaps"], robustness["tracked_pieces"]) == (2, 3)
+        assert robustness["lost_s"] == pytest.approx(4 * 0.05 + 2 * 0.05)
+        assert robustness["covered_share"] == pytest.approx(1 - 6 / (COUNT - 1), abs=1e-3)
+        assert robustness["robustness"] == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("how", ["beside", "asked", "poses that end"])
+def test_an_estimate_lost_for_good_has_no_robustness(
+    how: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pair, tracked = write_pair(tmp_path, noise=0.0), 12
+    times, poses = read_trajectory(pair[0])
+    if how == "poses that end":
+        write_trajectory(pair[0], times[:tracked], poses[:tracked])
+    else:
+        poses[tracked:] = poses[tracked - 1]
+        write_trajectory(pair[0], times, poses)
+        rows = [f"{t:.6f},{int(k < tracked)}" for k, t in enumerate(times)]
+        (tmp_path / "frames.csv").write_text("\n".join(["timestamp,tracking_ok", *rows]))
+    option = ["--frames", str(tmp_path / "frames.csv")] if how == "asked" else []
+    result = evaluate([*pair, *option], tmp_path / "out")
+    assert (result["robustness"], result["tracked_pieces"]) == (None, 1)
+    assert result["covered_share"] == pytest.approx((tracked - 1) / (COUNT - 1), abs=1e-3)
+    if how != "poses that end":
+        assert result["gaps"] == 1
+        assert result["lost_time_share"] == pytest.approx(1 - (tracked - 1) / (COUNT - 1))
+    reason = {"poses that end": "the truth goes on for 5.397 s after the last pose"}
+    said = reason.get(how, "no piece follows the last loss")
+    assert result["robustness_reason"].startswith(said)
+    shown = capsys.readouterr().out
+    assert f"robustness error not available: {said}" in shown
+    assert "(9 % of the truth's time)" in shown
+    assert said in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_an_estimate_lost_from_the_second_frame_is_not_whole(tmp_path: Path) -> None:
+    pair = write_pair(tmp_path, noise=0.0)
+    times, _ = read_trajectory(pair[0])
+    rows = [f"{t:.6f},{int(k == 0)}" for k, t in enumerate(times)]
+    (tmp_path / "frames.csv").write_text("\n".join(["timestamp,tracking_ok", *rows]))
+    result = evaluate_files(*map(Path, pair))
+    assert (result["robustness"], result["tracked_pieces"]) == (None, 0)
+    assert result["tracked_share"] == pytest.approx(1 / COUNT)
+    assert result["covered_share"] == 0.0
 
 
 def test_frames_beside_the_estimate_say_what_was_tracked(
@@ -307,7 +348,7 @@ def test_frames_beside_the_estimate_say_what_was_tracked(
     frames.write_text("\n".join(["timestamp,tracking_ok", *rows]))
     capsys.readouterr()
     result = evaluate(pair, tmp_path / "out")
-    assert (result["poses"], result["tracked_share"], result["gaps"]) == (COUNT, 0.75, 0)
+    assert (result["poses"], result["tracked_share"], result["gaps"]) == (COUNT, 0.75, COUNT // 4)
     assert result["ate_tracked_m"] == pytest.approx(metrics.ate_rmse(poses[ok], truth[ok]))
     assert result["ate_m"] == pytest.approx(metrics.ate_rmse(poses, truth))
     said = capsys.readouterr().out
