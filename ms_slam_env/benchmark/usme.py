@@ -26,6 +26,7 @@ from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, measured
 from ms_slam_env.scenes import Scene
+from ms_slam_env.sensor.noise import noise_config
 from ms_slam_env.sequences.usme_suite import NAMES, SUITE, UsmeSequence, find, made_with, render
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
             "hausdorff_directed_m",
             "recall_near",
         ),
-        *("noise_ratio", "spacing_m"),
+        *("noise_ratio", "noise_beyond_m", "outlier_share", "spacing_m"),
     ),
     "Robustness": (
         *("lost_share", "tracked_pieces", "robustness", "relocalisation_s"),
@@ -250,6 +251,10 @@ surfel SLAM needs filter widths that fit the noise of the camera there: with its
 lost 66 frames into a city street (seed 1000, 160x120), with these never.
 """
 
+_OF_MAPS = (
+    *("c2c_mean_m", "c2c_std_m", "hausdorff_directed_m", "recall_near"),
+    *("noise_ratio", "noise_beyond_m", "outlier_share", "spacing_m"),
+)
 _WARM_UP = 5  # frames left out of the timing: buffers grow, kernels are loaded
 _LOOP_VIEW_SIZE = "80x60"  # of the true depth used to find revisited places
 _PATH_POINTS = 200  # drawn per path
@@ -288,8 +293,9 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
         equations 1 to 5, the last pose's error relative to the path length (None if the last frame
         was lost: a pose held since the start would be right where a loop ends), the poses of the
         finished map. Map, after outlier removal (6) and ICP: distances, ``hausdorff_directed_m``
-        (7, spurious points of the map), ``recall_near``, ``noise_ratio`` (8). Robustness (9 to 11,
-        infinite: never relocalised) and, for a backend that closes loops, all of ``loop_measures``.
+        (7, spurious points of the map), ``recall_near``, ``noise_ratio`` (8) of all points, also
+        those that outlier removal drops. Robustness (9 to 11, infinite: never relocalised) and,
+        for a backend that closes loops, all of ``loop_measures``.
         Initialisation (12, 13). Cost: all of ``CostMeter.summary``. Paths for plotting.
     """
     entry = find(spec.sequence)
@@ -315,6 +321,7 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
     robustness = metrics.tracking_robustness(poses, truth, tracked)
     path = metrics.path_length(truth)
     surface = _seen_surface(scene, sequence.poses, options)
+    sigma_m = noise_config(entry.noise).depth_sigma_m(_reach_m(options))
     loops: dict[str, Any] = {}
     if system.closes_loops:
         loops = _loop_measures(run, scene, truth, options)
@@ -340,7 +347,7 @@ def run_usme(spec: UsmeSpec) -> dict[str, Any]:
         "initialisation_s": start.time_s,
         "scale_error": start.scale_error,
         **costs.summary(skip=min(_WARM_UP, len(poses) - 1)),
-        **map_measures(system.surface_points(), surface, entry.scene),
+        **map_measures(system.surface_points(), surface, entry.scene, sigma_m),
         **loops,
         **_positions("path", poses[drawn]),
         **_positions("true", truth[drawn]),
@@ -427,27 +434,29 @@ def voxel_m(scene: str) -> float:
     return 0.05 if scene in scenes.LARGE_SCENES else 0.01
 
 
-def map_measures(points: Float64, surface: Float64, scene: str) -> dict[str, Any]:
-    """Measure the map (N, 3) against the true surface (M, 3); see `run_usme`."""
+def map_measures(points: Float64, surface: Float64, scene: str, sigma_m: float) -> dict[str, Any]:
+    """Measure the map (N, 3) against the true surface (M, 3); see `run_usme`.
+
+    ``sigma_m`` is the sensor's depth noise at the end of SLAM's range: what lies farther from the
+    surface than that explains (`noise_ratio`), no reading put there.
+    """
     near = 5 * voxel_m(scene)
-    nothing = dict.fromkeys(
-        ("c2c_mean_m", "c2c_std_m", "hausdorff_directed_m", "recall_near", "noise_ratio")
-    )
-    result: dict[str, Any] = {"map_points": len(points), "near_m": near, **nothing}
-    result["spacing_m"] = None
+    result: dict[str, Any] = {"map_points": len(points), "near_m": near, **dict.fromkeys(_OF_MAPS)}
     cloud = metrics.voxel_downsample(points, voxel_m(scene)) if len(points) else points
     if len(cloud) < 100:
         return result
     if len(cloud) > _MOST_POINTS:
         cloud = cloud[np.linspace(0, len(cloud) - 1, _MOST_POINTS).astype(np.int64)]
     inliers = metrics.statistical_inliers(cloud)
-    kept = cloud[inliers]
-    found = metrics.register_clouds(kept, surface, "icp", cutoff_m=10 * near)
-    placed = ComparedMap(transform_points(found.T_target_source, kept), surface, voxel_m=0)
+    found = metrics.register_clouds(cloud[inliers], surface, "icp", cutoff_m=10 * near)
+    every = transform_points(found.T_target_source, cloud)
+    placed = ComparedMap(every[inliers], surface, voxel_m=0)
     return {
         **result,
         **placed.measure(("c2c_mean_m", "c2c_std_m", "hausdorff_directed_m")),
         "recall_near": placed.recall(near),
-        "noise_ratio": 1.0 - float(inliers.mean()),
+        "noise_ratio": metrics.noise_ratio(every, placed.surface, sigma_m),
+        "noise_beyond_m": metrics.noise_distance(placed.surface, sigma_m),
+        "outlier_share": 1.0 - float(inliers.mean()),
         "spacing_m": metrics.point_spacing(cloud),
     }

@@ -93,6 +93,9 @@ class Arguments:
     """Standard deviations above the mean beyond which a point is an outlier."""
     two_sided: bool = False
     """Also remove points that many standard deviations below the mean, as USME does."""
+    noise_sigma_m: float = 0.01
+    """Standard deviation of the sensor's depth; points of the map farther from the true surface
+    than three of it (and the spacing of the true points, added in squares) are noise."""
     out: Path | None = None
     """Folder of the results."""
 
@@ -144,7 +147,7 @@ def main(arguments: Sequence[str]) -> int:
 
 _OF_MAPS = (
     *("register", "cutoff_m", "remove_outliers", "neighbours", "std_ratio", "two_sided"),
-    *("thresholds_m", "voxel_m", "samples"),
+    *("noise_sigma_m", "thresholds_m", "voxel_m", "samples"),
 )
 
 

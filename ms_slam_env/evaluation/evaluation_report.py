@@ -338,7 +338,8 @@ def save_map_picture(compared: ComparedMap, path: Path) -> Path:
 
 
 def _map_keys(options: MapOptions) -> tuple[str, ...]:
-    return (*share_keys(options.thresholds_m), *MEASURES, "noise_ratio", "spacing_m")
+    others = ("noise_ratio", "noise_beyond_m", "outlier_share", "spacing_m")
+    return (*share_keys(options.thresholds_m), *MEASURES, *others)
 
 
 def _shares(distances: Float64, limits: Float64) -> Float64:

@@ -106,11 +106,26 @@ def test_a_system_lost_for_good_has_no_good_values(tracked, monkeypatch):
 def test_a_map_against_itself_is_without_error():
     rng = np.random.default_rng(0)
     plane = np.column_stack([rng.uniform(0, 2, (20_000, 2)), 0.003 * rng.standard_normal(20_000)])
-    found = usme.map_measures(plane, plane, "living_room")
+    found = usme.map_measures(plane, plane, "living_room", 0.01)
+    assert found["noise_ratio"] == 0
     assert found["c2c_mean_m"] < 1e-3
     assert found["recall_near"] > 0.99
-    empty = usme.map_measures(np.zeros((0, 3)), plane, "living_room")
-    assert (empty["map_points"], empty["c2c_mean_m"]) == (0, None)
+    empty = usme.map_measures(np.zeros((0, 3)), plane, "living_room", 0.01)
+    assert empty["map_points"] == 0
+    assert (empty["c2c_mean_m"], empty["noise_ratio"], empty["recall_near"]) == (None,) * 3
+
+
+def test_the_noise_of_a_map_grows_with_the_noise_of_its_points(true_room):
+    rng = np.random.default_rng(1)
+    cloud = true_room[rng.permutation(len(true_room))[:30_000]]
+    error, sigmas = rng.standard_normal(cloud.shape), (0.0, 0.005, 0.05, 0.3)
+    found = [usme.map_measures(cloud + s * error, true_room, "living_room", 0.01) for s in sigmas]
+    ratios = [one["noise_ratio"] for one in found]
+    assert ratios == sorted(ratios)
+    assert ratios[1] < 0.01
+    assert ratios[1] + 0.2 < ratios[2] < ratios[3] - 0.2
+    dropped = [one["outlier_share"] for one in found]  # what the filter drops says nothing of it
+    assert max(dropped) < 0.1
 
 
 def run_here(specs, run, *_, **__):
@@ -119,6 +134,11 @@ def run_here(specs, run, *_, **__):
         {"key": spec.backend, "spec": spec.__dict__, "result": run(spec), "error": None}
         for spec in specs
     ]
+
+
+@pytest.fixture(scope="module")
+def true_room():
+    return make_scene("living_room", SEED).surface_points(0.02)[0]
 
 
 @pytest.mark.usefixtures("cheap")

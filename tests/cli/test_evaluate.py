@@ -459,7 +459,8 @@ def test_maps_by_their_measures(maps: list[str], tmp_path: Path) -> None:
         "completion_cm": metrics.completion(points, surface).completion_cm,
         "c2c_rms_m": metrics.cloud_distance(points, surface).rms,
         "hausdorff_m": metrics.hausdorff_distance(points, surface),
-        "noise_ratio": metrics.noise_ratio(points),
+        "noise_ratio": metrics.noise_ratio(points, surface),
+        "noise_beyond_m": 3 * np.hypot(0.01, metrics.point_spacing(surface)),
         "spacing_m": metrics.point_spacing(points),
     }
     for name, value in expected.items():
@@ -478,7 +479,9 @@ def test_registered_maps_lie_where_they_belong(
     assert result["registration_share"] > 0.99
     assert result["hausdorff_directed_m"] < 0.05
     assert result["precision_2cm"] > 0.9  # points of either surface are 17 mm apart
-    assert result["noise_ratio"] == pytest.approx(10 / 20_010)
+    assert result["outlier_share"] == pytest.approx(10 / 20_010)
+    far = 10 / (result["compared_points"] + 10)  # one a voxel, with those that were removed
+    assert result["noise_ratio"] == pytest.approx(far)
 
 
 def test_a_sequence_stands_for_the_surface_that_it_saw(tmp_path: Path) -> None:
