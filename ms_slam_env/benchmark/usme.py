@@ -20,8 +20,10 @@ from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.loop_closures import find_revisits, loop_measures
 from ms_slam_env.evaluation.map_quality import ComparedMap
 from ms_slam_env.evaluation.run_sequence import SequenceRun, run_sequence
+from ms_slam_env.evaluation.seen_surface import surface_in_views
 from ms_slam_env.evaluation.trajectory_charts import thinned
 from ms_slam_env.geometry import transform_points
+from ms_slam_env.geometry.point_clouds import ASKEW
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.records import Row
 from ms_slam_env.report.tables import Table, finished, make_table, measured
@@ -411,26 +413,19 @@ def _final_ate(run: SequenceRun, truth: Float64) -> float | None:
     return None if corrected is None else metrics.ate_rmse(corrected, truth)
 
 
-def _seen_surface(scene: Scene, poses: Float64, options: dict[str, Any]) -> Float64:
+def _seen_surface(scene: Scene, poses: Float64, options: Mapping[str, Any]) -> Float64:
     """Return the true surface (M, 3) seen within SLAM's depth range, without moving objects."""
-    from ms_slam_env.sensor import RGBDSensor
-
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     walked = np.concatenate([[0.0], np.cumsum(steps)])
     count = int(min(_MOST_VIEWS, max(20, walked[-1] / _VIEW_EVERY_M)))
-    picked = np.searchsorted(walked, np.linspace(0.0, walked[-1], count))
-    sensor = RGBDSensor(scene, xtion(_VIEW_SIZE), noise="none")
-    reach, voxel = _reach_m(options), voxel_m(scene.name)
-    clouds = []
-    for index in np.unique(picked):
-        view = sensor.ground_truth(poses[index])
-        near = (view.depth > 0) & (view.depth <= reach)
-        clouds.append(metrics.voxel_downsample(view.points[near].astype(np.float64), voxel))
-    return metrics.voxel_downsample(np.concatenate(clouds), voxel)
+    picked = np.unique(np.searchsorted(walked, np.linspace(0.0, walked[-1], count)))
+    return surface_in_views(
+        scene, poses[picked], xtion(_VIEW_SIZE), _reach_m(options), voxel_m(scene.name)
+    )
 
 
 def voxel_m(scene: str) -> float:
-    """Return the voxel edge for downsampling clouds, which makes a surface count by its area."""
+    """Return the spacing of the true surface's points, and the voxel edge for downsampling maps."""
     return 0.05 if scene in scenes.LARGE_SCENES else 0.01
 
 
@@ -442,7 +437,7 @@ def map_measures(points: Float64, surface: Float64, scene: str, sigma_m: float) 
     """
     near = 5 * voxel_m(scene)
     result: dict[str, Any] = {"map_points": len(points), "near_m": near, **dict.fromkeys(_OF_MAPS)}
-    cloud = metrics.voxel_downsample(points, voxel_m(scene)) if len(points) else points
+    cloud = metrics.voxel_downsample(points, voxel_m(scene), ASKEW) if len(points) else points
     if len(cloud) < 100:
         return result
     if len(cloud) > _MOST_POINTS:

@@ -82,7 +82,8 @@ class Arguments:
     thresholds_m: tuple[float, ...] = (0.02, 0.05)
     """Distance thresholds for precision, recall and F-score of the map."""
     voxel_m: float = 0.01
-    """Downsample maps to one point per voxel of this edge length; 0 keeps all points."""
+    """Downsample maps to one point per voxel of this edge length; 0 keeps all points. A true mesh
+    is sampled by area and not downsampled."""
     samples: int = 200_000
     """Number of points sampled from a mesh."""
     remove_outliers: bool = False

@@ -23,6 +23,7 @@ from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
 from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.geometry import MAX_COORDINATE_M, transform_points
 from ms_slam_env.geometry.cloud_registration import CUTOFF_M, REGISTRATIONS
+from ms_slam_env.geometry.point_clouds import ASKEW
 from ms_slam_env.metrics.reconstruction import NOISE_SIGMA_M, SAMPLES
 from ms_slam_env.scenes.mesh_formats import MESH_SUFFIXES, MeshFile
 from ms_slam_env.sequences.recording import Recording, open_recording, recorded_sequence
@@ -49,7 +50,7 @@ class MapOptions(Checked):
             on a point counts as noise, see `noise_distance`.
         thresholds_m: thresholds of precision, recall and F-score.
         voxel_m: keep one point per voxel of this side in both clouds, so that each surface counts
-            by its area; 0 keeps all.
+            by its area; 0 keeps all. The samples of a true mesh are uniform by area and all kept.
         samples: number of points sampled from a mesh.
         seed: seed of the sampling.
     """
@@ -97,7 +98,8 @@ def evaluate_maps(
     kept = read.points[inliers] if options.remove_outliers else read.points
     if len(kept) == 0:
         raise InputError(f"statistical outlier removal leaves nothing of {estimate}")
-    points, surface = (_thin(cloud, options.voxel_m) for cloud in (kept, true.points))
+    points = _thin(kept, options.voxel_m)
+    surface = true.points if true.kind == "mesh" else _thin(true.points, options.voxel_m)
     found = metrics.register_clouds(points, surface, options.register, options.cutoff_m)
     points = transform_points(found.T_target_source, points)
     every = points
@@ -125,7 +127,7 @@ def evaluate_maps(
 
 
 def _thin(points: Float64, voxel_m: float) -> Float64:
-    return metrics.voxel_downsample(points, voxel_m) if voxel_m > 0 else points
+    return metrics.voxel_downsample(points, voxel_m, ASKEW) if voxel_m > 0 else points
 
 
 @dataclass(frozen=True)

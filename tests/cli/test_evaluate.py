@@ -21,7 +21,7 @@ from ms_slam_env import metrics
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.evaluation.map_files import evaluate_maps
+from ms_slam_env.evaluation.map_files import MapOptions, evaluate_maps
 from ms_slam_env.evaluation.run_files import write_ply
 from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions
 from ms_slam_env.evaluation.trajectory_measures import absolute_key, evaluate_files, statistic_keys
@@ -467,6 +467,35 @@ def test_maps_by_their_measures(maps: list[str], tmp_path: Path) -> None:
         assert result[name] == pytest.approx(value, abs=1e-12), name
     assert result["hausdorff_m"] > 3
     np.testing.assert_array_equal(result["T_true_map"], np.eye(4))
+
+
+@pytest.mark.parametrize("kind", ["mesh", "cloud"])
+def test_a_plane_on_the_border_of_voxels_counts_once(kind: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    found = []
+    for jitter in (0.0, 1e-7):
+        plates = [trimesh.creation.box(extents=[2.0, 2.0, 0.0]) for _ in range(2)]
+        plates[1].apply_translation([0, 0, 1.0025])
+        corners = np.concatenate([plate.vertices[[0, 2, 6, 4]] for plate in plates])
+        faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+        true = trimesh.Trimesh(corners, faces, process=False)
+        if kind == "cloud":
+            points, _ = trimesh.sample.sample_surface(true, 40_000, seed=0)
+            points = np.asarray(points) + rng.uniform(-jitter, jitter, (40_000, 3))
+            write_ply(tmp_path / "true.ply", points, {})
+        else:
+            true.vertices = true.vertices + rng.uniform(-jitter, jitter, true.vertices.shape)
+            true.export(tmp_path / "true.obj", digits=12)
+        lower = np.column_stack([rng.uniform(-1, 1, (20_000, 2)), np.zeros(20_000)])
+        lower[:, 2] += rng.uniform(-jitter, jitter, len(lower))
+        write_ply(tmp_path / "map.ply", lower, {})
+        truth = tmp_path / ("true.ply" if kind == "cloud" else "true.obj")
+        options = MapOptions(voxel_m=0.05, samples=20_000)
+        found.append(evaluate_maps(tmp_path / "map.ply", truth, options)[0])
+    for one in found:
+        assert one["completion_ratio"] == pytest.approx(0.5, abs=0.02)
+        assert one["completion_cm"] == pytest.approx(51.3, abs=2)
+    assert found[0]["accuracy_cm"] == pytest.approx(found[1]["accuracy_cm"], rel=0.01)
 
 
 @pytest.mark.parametrize("method", ["icp", "plane-icp", "gicp"])
