@@ -78,6 +78,10 @@ class Experiment(ABC):
     def write_pictures(self, rows: Sequence[Row], out: Path) -> None:  # noqa: B027
         """Write pictures that are not charts into folder ``out``; none by default."""
 
+    def placed(self, out: Path) -> Experiment:
+        """Return the experiment as it runs for folder ``out``, where rows may leave files."""
+        return self
+
     def spec(self, kind: type[S], **own: Any) -> S:
         """Make one spec from the fields ``own`` and, for the others, options of the same name."""
         options = {field.name for field in dataclasses.fields(self)}  # type: ignore[arg-type]

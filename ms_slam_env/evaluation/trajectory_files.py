@@ -200,6 +200,36 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
     )
 
 
+def matched_frames(
+    times: Float64, poses: Float64, truth: Float64, tracked: NDArray[np.bool_]
+) -> Matched:
+    """Compare the poses of a run with the true ones of the same frames, after SE(3) alignment.
+
+    Args:
+        times: (N,) seconds.
+        poses: (N, 4, 4) T_world_camera, held where a frame was lost.
+        truth: (N, 4, 4).
+        tracked: (N,) whether the frame was tracked.
+    """
+    alignment = metrics.find_alignment(poses, truth)
+    gaps = _gaps(times, np.flatnonzero(tracked), np.inf)
+    return Matched(
+        times=times,
+        estimate=alignment.poses(poses),
+        raw=poses,
+        truth=truth,
+        true_path=truth[:, :3, 3],
+        piece=np.concatenate([[0], np.cumsum(tracked[1:] != tracked[:-1])]),
+        gaps=gaps,
+        alignment=alignment,
+        unmatched=0,
+        tracked=tracked,
+        tracked_share=float(tracked.mean()),
+        span_s=float(times[-1] - times[0]),
+        covered_share=_covered(times, gaps, times),
+    )
+
+
 def _gaps(times: Float64, kept: NDArray[np.int64], gap_s: float) -> Float64:
     """Gaps (K, 2) in seconds between the ``kept`` (M,) of the ``times`` (N,), and beyond them."""
     at = np.unique([0, *kept, len(times) - 1])

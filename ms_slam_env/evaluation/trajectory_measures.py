@@ -160,6 +160,11 @@ def _relative(matched: Matched, part: slice, options: TrajectoryOptions) -> dict
     return found
 
 
+def relative_statistics(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
+    """Statistics of the relative errors over one spacing, ``rpe_m`` and ``rpe_rad`` by key."""
+    return _relative(matched, slice(None), options)
+
+
 def _relative_or_none(matched: Matched, part: slice, options: TrajectoryOptions) -> dict[str, Any]:
     """Relative errors; None for a piece too short to contain a pair of poses."""
     try:

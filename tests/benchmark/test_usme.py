@@ -1,6 +1,8 @@
 """``ms-slam usme``: measures, tables, folders, bad input."""
 
 import json
+import sys
+from dataclasses import asdict, replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -25,6 +27,7 @@ def cheap(monkeypatch):
     """Scenes are built once, the true surface is seen in small images."""
     monkeypatch.setattr(scenes, "make", make_scene)
     monkeypatch.setattr(usme, "_VIEW_SIZE", "80x60")
+    monkeypatch.setattr(usme, "voxel_m", lambda _: 0.04)
 
 
 def test_options_of_a_backend_are_those_of_the_sequence():
@@ -52,17 +55,21 @@ def test_one_run_has_every_measure():
     assert result["revisits"] <= result["revisiting_frames"] < result["frames"]
     assert len(result["path_x_m"]) == len(result["true_y_m"]) == result["frames"]
     assert result["true_x_m"][0] == result["path_x_m"][0]  # it starts at the true pose
-    row = {"spec": {"sequence": "room-fast-black", "backend": backend}}
+    row = {"spec": {"sequence": "room-fast-black", "backend": backend, "seed": SEED}}
     failed = {**row, "result": None, "error": "InputError: no"}
     tables = usme.Usme().tables([{**row, "result": result, "error": None}, failed])
-    assert [table.title for table in tables] == ["Sequences", *usme.TABLES]
-    assert [len(table.rows) for table in tables] == [1] * 6
+    titles = ["Summary", "Sequences", "Accuracy", "Relative errors", *list(usme.TABLES)[1:]]
+    assert [table.title for table in tables] == titles
+    assert [len(table.rows) for table in tables] == [1, 1, 1, len(result["by_delta"]), *[1] * 4]
+    assert "1 m" in {line["delta_text"] for line in result["by_delta"]}
+    (whole,) = (line for line in result["by_delta"] if line["delta_text"] == "1 frames")
+    assert (whole["rpe_m"], whole["rpe_median_m"]) == (result["rpe_m"], result["rpe_median_m"])
     _, paths = usme.Usme().charts([{**row, "result": result, "error": None}, failed])
     assert [series.name for series in paths.panels[0].series] == [backend, "truth"]
     del result["loop_recall"]  # of a backend that closes no loops nothing is said of them
     closes_none = usme.Usme().tables([{**row, "result": result, "error": None}])
-    assert [len(table.rows) for table in closes_none] == [1, 1, 1, 1, 0, 1]
-    assert tables[0].rows[0]["about"] == "the same with a run of black frames"
+    assert [len(table.rows) for table in closes_none if table.title == "Loops"] == [0]
+    assert tables[1].rows[0]["about"] == "the same with a run of black frames"
 
 
 @pytest.mark.usefixtures("cheap")
@@ -83,9 +90,6 @@ def test_a_system_lost_for_good_has_no_good_values(tracked, monkeypatch):
 
     monkeypatch.setattr(usme, "slam", SimpleNamespace(make=make))
     spec = usme.UsmeSpec("room-fast", "odometry", "80x60", SEED, frames_scale=0.3)
-    monkeypatch.setattr(
-        usme, "_frames", lambda sequence, _: (sequence.frames[k] for k in range(20))
-    )
     render = usme.render
     monkeypatch.setattr(usme, "render", lambda *a: render(*a).picked(np.arange(20)))
     result = usme.run_usme(spec)
@@ -97,10 +101,96 @@ def test_a_system_lost_for_good_has_no_good_values(tracked, monkeypatch):
     assert result["tracked_pieces"] == 1
     for key in ("robustness", "end_error_m", "end_error_share"):
         assert result[key] is None, key
-    row = {"spec": {"sequence": "room-fast", "backend": "odometry"}, "result": result}
-    for table in usme.Usme().tables([{**row, "error": None}])[1:]:
-        names = {column.name for column in table.columns}
-        assert names & {"tracked_share", "lost_share"}, table.title
+    spec = {"sequence": "room-fast", "backend": "odometry", "seed": SEED}
+    tables = usme.Usme().tables([{"spec": spec, "result": result, "error": None}])
+    for table in tables:
+        if table.title not in ("Sequences", "Relative errors"):
+            names = {column.name for column in table.columns}
+            assert names & {"tracked_share", "lost_share"}, table.title
+    assert (tables[0].rows[0]["runs_counted"], tables[0].rows[0]["successes"]) == (1, 0)
+
+
+def _rows(**results):
+    spec = {"sequence": "room-fast", "backend": "surfel"}
+    base = usme_row()
+    return [
+        {"spec": {**spec, "seed": k}, "result": {**base, **one}, "error": None}
+        for k, one in enumerate(results["results"])
+    ]
+
+
+def usme_row():
+    keys = {key for family in usme.TABLES.values() for key in family} | set(usme.SUMMARY)
+    return {**dict.fromkeys(keys - {"run_succeeded"}), "path_m": 10.0, "lost_share": 0.0}
+
+
+def test_several_seeds_have_medians_and_a_count_of_successes():
+    results = [
+        {"ate_m": 0.02},
+        {"ate_m": 0.03},
+        {"ate_m": 0.2},  # more than 1 % of the path
+        {"ate_m": 0.01, "lost_share": 0.06},
+    ]
+    tables = usme.Usme().tables(_rows(results=results))
+    (line,) = tables[0].rows
+    assert (line["runs_counted"], line["successes"]) == (4, 2)
+    assert line["ate_m"].value == pytest.approx(0.025)
+    assert [row["seed"] for row in tables[2].rows] == [0, 1, 2, 3]
+    assert [row["run_succeeded"] for row in tables[2].rows] == [True, True, False, False]
+
+
+@pytest.mark.usefixtures("cheap")
+def test_what_surfel_wrote_is_its_row_again(tmp_path):
+    how = {"image_size": "80x60", "seed": SEED, "frames_scale": 0.12}
+    own = usme.Usme(
+        backends=("surfel",), sequences=("room-fast-black",), seeds=1, keep=tmp_path / "kept", **how
+    )
+    (spec,) = own.specs()
+    first = usme.run_usme(spec)
+    folder = tmp_path / "kept/surfel" / f"room-fast-black-{SEED}"
+    assert {path.name for path in folder.iterdir()} == {
+        *("trajectory.txt", "frames.csv", "map.ply", "map.png")
+    }
+    assert (folder / "map.png").stat().st_size > 5000
+    path = str(tmp_path / "kept/surfel")
+    again = usme.Usme(
+        backends=(), trajectories=(f"fed={path}",), maps=(f"fed={path}",),
+        sequences=("room-fast-black",), seeds=1, **how,
+    )  # fmt: skip
+    (fed,) = again.specs()
+    assert (fed.backend, fed.trajectory) == ("fed", str(folder / "trajectory.txt"))
+    second = usme.run_usme(fed)
+    costs = [key for key in first if key.startswith(("ext_", "cpu_", "mem_", "ene"))]
+    assert second.keys() == first.keys() - costs
+    for key in second.keys() - {"drift_by_length", "by_delta", "T_true_map"}:
+        if key == "final_ate_m":
+            assert second[key] is None
+        elif isinstance(first[key], float):
+            assert second[key] == pytest.approx(first[key], rel=1e-3, abs=1e-5, nan_ok=True), key
+        elif not isinstance(first[key], list):
+            assert second[key] == first[key], key
+    frames = (folder / "frames.csv").read_text().splitlines()[1:]
+    ok = np.array([line.endswith(",1") for line in frames])
+    assert first["lost_share"] == pytest.approx(1 - ok.mean())
+    # The same by a program, which cannot say what it tracked and has no map.
+    script = tmp_path / "copy.py"
+    script.write_text("import pathlib, shutil, sys\n"
+                      "assert (pathlib.Path(sys.argv[1]) / 'rgb.txt').is_file()\n"
+                      "shutil.copy(sys.argv[2], sys.argv[3])\n")  # fmt: skip
+    program = f"{sys.executable} {script} {{sequence}} {folder}/trajectory.txt {{trajectory}}"
+    run = replace(again, backends=(f"mine=command:{program}",), trajectories=(), maps=())
+    (spec,) = run.specs()
+    third = usme.run_usme(spec)
+    assert spec.backend == "mine"
+    assert third["ate_m"] == pytest.approx(first["ate_m"], rel=1e-4)
+    assert third["lost_share"] == 0
+    assert third["ext_ms"] > 0
+    assert (third["map_points"], third["noise_ratio"], third["recall_near"]) == (None,) * 3
+    tables = usme.Usme().tables(
+        [{"spec": asdict(one), "result": row, "error": None}
+         for one, row in ((own.specs()[0], first), (fed, second), (spec, third))]
+    )  # fmt: skip
+    assert [row["backend"] for row in tables[0].rows] == ["surfel", "fed", "mine"]
 
 
 def test_a_map_against_itself_is_without_error():
@@ -210,6 +300,11 @@ def test_make_writes_what_run_reads(tmp_path, capsys, monkeypatch):
         (["make", "--sequences", "x"], "unknown USME sequence 'x'"),
         (["make", "--image-size", "1x1"], "unknown image size"),
         (["run", "/nowhere"], "holds no finished sequence"),
+        (["run", "--backends", "command:ls {sequence}"], "lacks {trajectory}"),
+        (["run", "--trajectories", "orb=/nowhere"], "no trajectory of orb: /nowhere"),
+        (["run", "--maps", "orb=/nowhere"], "unknown system of a map 'orb'"),
+        (["run", "--trajectories", "surfel=/nowhere"], "must differ"),
+        (["run", "/nowhere", "--seeds", "2"], "a folder holds one seed"),
     ],
 )
 def test_bad_input_is_one_line(arguments, message, capsys):
