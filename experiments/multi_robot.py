@@ -346,8 +346,8 @@ def serve(team: Team, T_world_map: dict[int, Float64], spec: MultiRobotSpec) -> 
         ),
         "server_links": made.links,
         "server_cpu_s": seconds,
-        "noise_ratio": metrics.noise_ratio(fused),
-        "merged_noise_ratio": metrics.noise_ratio(laid),
+        "noise_ratio": metrics.noise_ratio(fused, team.surface),
+        "merged_noise_ratio": metrics.noise_ratio(laid, team.surface),
         **map_quality(fused, team.surface, reference=team.seen),
     }
 

@@ -19,8 +19,8 @@ from ms_slam_env.evaluation.run_sequence import run_backend
 from ms_slam_env.report.tables import Grouping, Row, Table, finished, make_table
 
 METRICS = (
-    *("relocalisation_found_s", "relocalisations", "never_relocalised", "robustness"),
-    *("ate_m", "ate_tracked_m", "tracked_share"),
+    *("relocalisation_found_s", "relocalisations", "never_relocalised"),
+    *("tracked_pieces", "robustness", "ate_m", "ate_tracked_m", "tracked_share"),
 )
 
 
@@ -103,14 +103,14 @@ class Orbit(Experiment, Checked):
             on_step=lambda step: black.append(not step.frame.color.any()),
         )
         found = metrics.relocalisation(run.timestamps, black, run.anchored)
-        pieces = len(metrics.tracked_segments(run.tracking_ok))
-        error = metrics.tracking_robustness(run.estimates, poses, run.tracking_ok).error
+        robustness = metrics.tracking_robustness(run.estimates, poses, run.tracking_ok)
         return {
             "frames": len(run),
             "relocalisation_found_s": found.mean_s,
             "relocalisations": found.found,
             "never_relocalised": found.never,
-            "robustness": error if pieces else None,
+            "tracked_pieces": len(robustness.segments),
+            "robustness": robustness.error,
             "ate_m": metrics.ate_rmse(run.estimates, poses),
             **metrics.tracked_errors(run.estimates, poses, run.tracking_ok),
             "black_tracked": int((np.array(black) & run.tracking_ok).sum()),

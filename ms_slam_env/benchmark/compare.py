@@ -344,6 +344,31 @@ def _opened(spec: CompareSpec) -> RGBDSequence:
 
 
 def _judged(path: Path, sequence: RGBDSequence) -> dict[str, Any]:
+    placed = placed_poses(path, sequence)
+    return _errors(placed.poses, sequence.poses, placed.tracked)
+
+
+@dataclass(frozen=True)
+class PlacedPoses:
+    """The poses of a trajectory file at the frames of a sequence.
+
+    Attributes:
+        poses: (N, 4, 4) T_world_camera; a frame without a pose holds the last one.
+        tracked: (N,) whether the frame has a pose, and no ``frames.csv`` calls it lost.
+        T_world_own: (4, 4) from the world of the file, whose first pose is put on the true one.
+    """
+
+    poses: Float64
+    tracked: NDArray[np.bool_]
+    T_world_own: Float64
+
+
+def placed_poses(path: Path, sequence: RGBDSequence) -> PlacedPoses:
+    """Read a TUM file and put its poses on the frames of a sequence.
+
+    Raises:
+        InputError: the file cannot be read, or has fewer than two poses of the sequence.
+    """
     times, poses = read_trajectory(path)
     own, at = associate(times, sequence.timestamps, MAX_DIFFERENCE_S)
     if len(own) < 2:
@@ -355,7 +380,7 @@ def _judged(path: Path, sequence: RGBDSequence) -> dict[str, Any]:
     tracked[at] = True if said is None else said[own]
     held = np.searchsorted(at, np.arange(len(sequence)), side="right") - 1
     T_world_own = sequence.poses[at[0]] @ invert(poses[own[0]])  # a backend starts at the truth
-    return _errors(T_world_own @ poses[own[np.maximum(held, 0)]], sequence.poses, tracked)
+    return PlacedPoses(T_world_own @ poses[own[np.maximum(held, 0)]], tracked, T_world_own)
 
 
 def _errors(estimates: Float64, truth: Float64, tracked: NDArray[np.bool_]) -> dict[str, Any]:

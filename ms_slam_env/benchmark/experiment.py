@@ -10,6 +10,7 @@ import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from ms_slam_env._runtime.extension import ExtensionPoint
@@ -76,6 +77,10 @@ class Experiment(ABC):
     def content(self, rows: Sequence[Row]) -> Mapping[str, Any]:
         """Return further entries of ``results.json``; none by default."""
         return {}
+
+    def placed(self, out: Path) -> Experiment:
+        """Return the experiment as it runs for folder ``out``, where rows may leave files."""
+        return self
 
     def spec(self, kind: type[S], **own: Any) -> S:
         """Make one spec from the fields ``own`` and, for the others, options of the same name."""

@@ -223,6 +223,7 @@ def run_experiment(
             process working in ``out``.
         RuntimeError: every row failed; the files of an earlier run stay unchanged.
     """
+    experiment = experiment.placed(out)
     specs = experiment.specs()
     if not specs:
         raise InputError(f"no {experiment.unit} to run: an option is an empty list")

@@ -82,7 +82,8 @@ class Arguments:
     thresholds_m: tuple[float, ...] = (0.02, 0.05)
     """Distance thresholds for precision, recall and F-score of the map."""
     voxel_m: float = 0.01
-    """Downsample maps to one point per voxel of this edge length; 0 keeps all points."""
+    """Downsample maps to one point per voxel of this edge length; 0 keeps all points. A true mesh
+    is sampled by area and not downsampled."""
     samples: int = 200_000
     """Number of points sampled from a mesh."""
     remove_outliers: bool = False
@@ -93,6 +94,9 @@ class Arguments:
     """Standard deviations above the mean beyond which a point is an outlier."""
     two_sided: bool = False
     """Also remove points that many standard deviations below the mean, as USME does."""
+    noise_sigma_m: float = 0.01
+    """Standard deviation of the sensor's depth; points of the map farther from the true surface
+    than three of it (and the spacing of the true points, added in squares) are noise."""
     out: Path | None = None
     """Folder of the results."""
 
@@ -144,7 +148,7 @@ def main(arguments: Sequence[str]) -> int:
 
 _OF_MAPS = (
     *("register", "cutoff_m", "remove_outliers", "neighbours", "std_ratio", "two_sided"),
-    *("thresholds_m", "voxel_m", "samples"),
+    *("noise_sigma_m", "thresholds_m", "voxel_m", "samples"),
 )
 
 

@@ -38,12 +38,13 @@ _ABOUT = (
     "between two poses. Maps: distances between points of the map and of the true surface."
 )
 _ROBUSTNESS = (
-    *("gaps", "lost_s", "lost_time_share", "tracked_pieces", "robustness"),
+    *("gaps", "lost_s", "lost_time_share", "covered_share", "tracked_pieces", "robustness"),
     *("robustness_translation_m", "robustness_rotation_rad", "robustness_log_scale"),
     *("initialisation_s", "initialisation_scale", "scale_error"),
 )
 _PRINTED = ("ate_printed_m", "rpe_printed_m", "rpe_printed_median_m")
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
+_MOST_COVERED = 0.99  # above this, the share of the truth's time is not worth a word
 _SHOWN_M = 0.1  # largest threshold in the curves of precision and recall
 _MAX_DOTS = 40_000
 
@@ -146,9 +147,10 @@ def trajectory_summary(found: Found, options: TrajectoryOptions) -> str:
             lines.append(f"{key.split('_')[0].upper()} [{key.split('_')[-1]}]  {shown}")
     if found["tracked_share"] is not None:
         lines.append(_of_tracked(found, options))
-    if found["gaps"]:
-        reason = found.get("robustness_reason") or f"{found['robustness']:.6f}"
-        lines.append(f"lost in {_gaps(found)}; robustness error {reason}")
+    reason = found.get("robustness_reason")
+    if found["gaps"] or reason:
+        text = f"not available: {reason}" if reason else f"{found['robustness']:.6f}"
+        lines.append(f"lost in {_gaps(found)}; robustness error {text}")
     return "\n".join(lines)
 
 
@@ -213,8 +215,12 @@ def trajectory_charts(matched: Matched, options: TrajectoryOptions) -> list[Char
 
 
 def _matched(found: Found) -> str:
-    """Number of poses behind the errors, in words."""
-    return f"{found['poses']} of {found['poses'] + found['unmatched_poses']} poses have a true one"
+    """Number of poses behind the errors, in words; their share of the time if they lack some."""
+    text = f"{found['poses']} of {found['poses'] + found['unmatched_poses']} poses have a true one"
+    covered = found["covered_share"]
+    return (
+        text if covered > _MOST_COVERED else f"{text} ({100 * covered:.0f} % of the truth's time)"
+    )
 
 
 def _errors(options: TrajectoryOptions) -> tuple[str, ...]:
@@ -332,7 +338,8 @@ def save_map_picture(compared: ComparedMap, path: Path) -> Path:
 
 
 def _map_keys(options: MapOptions) -> tuple[str, ...]:
-    return (*share_keys(options.thresholds_m), *MEASURES, "noise_ratio", "spacing_m")
+    others = ("noise_ratio", "noise_beyond_m", "outlier_share", "spacing_m")
+    return (*share_keys(options.thresholds_m), *MEASURES, *others)
 
 
 def _shares(distances: Float64, limits: Float64) -> Float64:

@@ -210,7 +210,8 @@ def _measured(
 
 
 def _keys(options: TrajectoryOptions) -> tuple[str, ...]:
-    return (absolute_key(options, "m"), absolute_key(options, "rad"), "rpe_m", "rpe_rad", "lost_s")
+    errors = (absolute_key(options, "m"), absolute_key(options, "rad"), "rpe_m", "rpe_rad")
+    return (*errors, "lost_s", "covered_share")
 
 
 def _delta(delta: float, options: TrajectoryOptions) -> str:

@@ -23,7 +23,8 @@ from ms_slam_env.evaluation.map_quality import ComparedMap, share_keys
 from ms_slam_env.evaluation.seen_surface import seen_surface
 from ms_slam_env.geometry import MAX_COORDINATE_M, transform_points
 from ms_slam_env.geometry.cloud_registration import CUTOFF_M, REGISTRATIONS
-from ms_slam_env.metrics.reconstruction import SAMPLES
+from ms_slam_env.geometry.point_clouds import ASKEW
+from ms_slam_env.metrics.reconstruction import NOISE_SIGMA_M, SAMPLES
 from ms_slam_env.scenes.mesh_formats import MESH_SUFFIXES, MeshFile
 from ms_slam_env.sequences.recording import Recording, open_recording, recorded_sequence
 
@@ -45,9 +46,11 @@ class MapOptions(Checked):
         neighbours: number of neighbours for the outlier statistics.
         std_ratio: standard deviations from the mean beyond which a point is an outlier.
         two_sided: whether points whose neighbours are unusually close are outliers, too.
+        noise_sigma_m: standard deviation of the sensor's depth, which decides from which distance
+            on a point counts as noise, see `noise_distance`.
         thresholds_m: thresholds of precision, recall and F-score.
         voxel_m: keep one point per voxel of this side in both clouds, so that each surface counts
-            by its area; 0 keeps all.
+            by its area; 0 keeps all. The samples of a true mesh are uniform by area and all kept.
         samples: number of points sampled from a mesh.
         seed: seed of the sampling.
     """
@@ -58,6 +61,7 @@ class MapOptions(Checked):
     neighbours: int = bounded(20, 2, 10_000)
     std_ratio: float = bounded(2.0, 1e-6, 1e6)
     two_sided: bool = False
+    noise_sigma_m: float = bounded(NOISE_SIGMA_M, 0.0, 1e3)
     thresholds_m: Sequence[float] = (0.02, 0.05)
     voxel_m: float = bounded(0.01, 0.0, 1e3)
     samples: int = bounded(SAMPLES, 1, 100_000_000)
@@ -94,9 +98,13 @@ def evaluate_maps(
     kept = read.points[inliers] if options.remove_outliers else read.points
     if len(kept) == 0:
         raise InputError(f"statistical outlier removal leaves nothing of {estimate}")
-    points, surface = (_thin(cloud, options.voxel_m) for cloud in (kept, true.points))
+    points = _thin(kept, options.voxel_m)
+    surface = true.points if true.kind == "mesh" else _thin(true.points, options.voxel_m)
     found = metrics.register_clouds(points, surface, options.register, options.cutoff_m)
     points = transform_points(found.T_target_source, points)
+    every = points
+    if options.remove_outliers:
+        every = transform_points(found.T_target_source, _thin(read.points, options.voxel_m))
     unregistered = options.register == "none"
     compared = ComparedMap(points, surface, voxel_m=0, registered=not unregistered)
     result = {
@@ -106,7 +114,9 @@ def evaluate_maps(
         "true_points": len(true.points),
         "compared_points": len(points),
         "compared_true_points": len(surface),
-        "noise_ratio": 1.0 - float(inliers.mean()),
+        "noise_ratio": metrics.noise_ratio(every, compared.surface, options.noise_sigma_m),
+        "noise_beyond_m": metrics.noise_distance(compared.surface, options.noise_sigma_m),
+        "outlier_share": 1.0 - float(inliers.mean()),
         "spacing_m": metrics.point_spacing(read.points),
         **compared.measure((*share_keys(options.thresholds_m), *MEASURES)),
         "registration_converged": None if unregistered else found.converged,
@@ -117,7 +127,7 @@ def evaluate_maps(
 
 
 def _thin(points: Float64, voxel_m: float) -> Float64:
-    return metrics.voxel_downsample(points, voxel_m) if voxel_m > 0 else points
+    return metrics.voxel_downsample(points, voxel_m, ASKEW) if voxel_m > 0 else points
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,8 @@ class TrajectoryOptions(Checked):
             median interval.
         frames: ``frames.csv`` of ``ms-slam run``. Poses of untracked frames, which it also
             writes, are left out, and each leaves a gap. Without this option, a ``frames.csv``
-            beside the estimate leaves nothing out, but adds the error of the tracked frames.
+            beside the estimate leaves no pose out of the errors, but its untracked frames are
+            gaps, too, and it adds the error of the tracked frames.
     """
 
     align: str = chosen("se3", *ALIGNMENTS)
@@ -98,12 +99,21 @@ class Matched:
         raw: (N, 4, 4) the same as read.
         truth: (N, 4, 4).
         true_path: (M, 3) all true positions from the first of these poses to the last.
-        piece: (N,) number of the piece, between gaps, that the pose belongs to.
-        gaps: (K, 2) last time before and first time after each gap.
+        piece: (N,) number of the piece, between gaps, that the pose belongs to; a run of
+            untracked frames is a piece of its own.
+        gaps: (K, 2) last time before and first time after each gap; where it is known which
+            frames were tracked, from the first frame or to the last if these were lost.
         alignment: the alignment found.
         unmatched: number of estimated poses without a true pose close enough in time.
         tracked: (N,) whether the frame was tracked; None if unknown.
         tracked_share: share of all estimated poses; None likewise.
+        lost_before: whether frames before these poses were left out as untracked.
+        lost_after: whether frames after these poses were left out as untracked.
+        span_s: seconds from the first pose of the estimate to its last, tracked or not.
+        truth_after_s: seconds for which the truth goes on after the last pose of the estimate.
+        ends_early: whether that is longer than a gap.
+        covered_share: share of the true trajectory's time in which the estimate has (tracked)
+            poses: neither before its first, nor after its last, nor in a gap.
     """
 
     times: Float64
@@ -117,6 +127,12 @@ class Matched:
     unmatched: int
     tracked: NDArray[np.bool_] | None = None
     tracked_share: float | None = None
+    lost_before: bool = False
+    lost_after: bool = False
+    span_s: float = 0.0
+    truth_after_s: float = 0.0
+    ends_early: bool = False
+    covered_share: float = 1.0
 
 
 def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matched:
@@ -132,11 +148,13 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
         else tracked_at(Path(options.frames), times)
     )
     share_tracked = None if tracked is None else float(tracked.mean())
-    was_lost = np.zeros(len(times), dtype=bool)
-    if options.frames is not None and tracked is not None:
-        kept = np.flatnonzero(tracked)
-        was_lost = np.diff(kept, prepend=kept[0] - 1) > 1
-        times, poses, tracked = times[kept], poses[kept], tracked[kept]
+    shown, every = times, np.arange(len(times))
+    kept = every if tracked is None else np.flatnonzero(tracked)
+    own = every if options.frames is None else kept
+    if options.frames is not None and len(own) < 2:
+        raise InputError(f"{options.frames} leaves {len(own)} tracked poses; at least 2 are needed")
+    times, poses = times[own], poses[own]
+    tracked = None if tracked is None else tracked[own]
     true_times, true_poses = read_trajectory(truth)
     first, second = associate(times, true_times, options.max_difference_s)
     if len(first) < 2:
@@ -156,20 +174,78 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
     gap_s = options.gap_s
     if gap_s is None:
         gap_s = _GAP_INTERVALS * float(np.median(np.diff(times)))
-    jumps = np.flatnonzero((np.diff(times) > gap_s) | was_lost[1:])
+    gaps = _gaps(shown, kept, gap_s)
+    truth_after_s = max(0.0, float(true_times[-1] - shown[-1]))
+    breaks = (np.diff(times) > gap_s) | (np.diff(own) > 1)
+    if tracked is not None:
+        breaks |= tracked[1:] != tracked[:-1]
     return Matched(
         times=times[first],
         estimate=alignment.poses(raw),
         raw=raw,
         truth=true,
         true_path=true_poses[second[0] : second[-1] + 1, :3, 3],
-        piece=np.searchsorted(jumps, first),
-        gaps=np.stack([times[jumps], times[jumps + 1]], axis=1),
+        piece=np.concatenate([[0], np.cumsum(breaks)])[first],
+        gaps=gaps,
         alignment=alignment,
         unmatched=len(times) - len(first),
         tracked=None if tracked is None else tracked[first],
         tracked_share=share_tracked,
+        lost_before=bool(own[0] > 0),
+        lost_after=bool(own[-1] < len(shown) - 1),
+        span_s=float(shown[-1] - shown[0]),
+        truth_after_s=truth_after_s,
+        ends_early=truth_after_s > gap_s,
+        covered_share=_covered(shown, gaps, true_times),
     )
+
+
+def matched_frames(
+    times: Float64, poses: Float64, truth: Float64, tracked: NDArray[np.bool_]
+) -> Matched:
+    """Compare the poses of a run with the true ones of the same frames, after SE(3) alignment.
+
+    Args:
+        times: (N,) seconds.
+        poses: (N, 4, 4) T_world_camera, held where a frame was lost.
+        truth: (N, 4, 4).
+        tracked: (N,) whether the frame was tracked.
+    """
+    alignment = metrics.find_alignment(poses, truth)
+    gaps = _gaps(times, np.flatnonzero(tracked), np.inf)
+    return Matched(
+        times=times,
+        estimate=alignment.poses(poses),
+        raw=poses,
+        truth=truth,
+        true_path=truth[:, :3, 3],
+        piece=np.concatenate([[0], np.cumsum(tracked[1:] != tracked[:-1])]),
+        gaps=gaps,
+        alignment=alignment,
+        unmatched=0,
+        tracked=tracked,
+        tracked_share=float(tracked.mean()),
+        span_s=float(times[-1] - times[0]),
+        covered_share=_covered(times, gaps, times),
+    )
+
+
+def _gaps(times: Float64, kept: NDArray[np.int64], gap_s: float) -> Float64:
+    """Gaps (K, 2) in seconds between the ``kept`` (M,) of the ``times`` (N,), and beyond them."""
+    at = np.unique([0, *kept, len(times) - 1])
+    has_pose = np.isin(at, kept)
+    is_gap = np.diff(times[at]) > gap_s
+    is_gap |= (np.diff(at) > 1) | ~has_pose[1:] | ~has_pose[:-1]
+    jumps = np.flatnonzero(is_gap)
+    return np.stack([times[at][jumps], times[at][jumps + 1]], axis=1)
+
+
+def _covered(times: Float64, gaps: Float64, true_times: Float64) -> float:
+    """Share of the true time between the first and last of ``times`` (N,) without the gaps."""
+    first, last = true_times[0], true_times[-1]
+    spans = np.clip(np.concatenate([[[times[0], times[-1]]], gaps]), first, last)
+    lengths = np.diff(spans, axis=1)[:, 0]
+    return float((lengths[0] - lengths[1:].sum()) / (last - first)) if last > first else 1.0
 
 
 def complaints(aligned: Float64, truth: Float64, share: float, is_turned: bool = True) -> list[str]:
@@ -229,7 +305,7 @@ def tracked_at(path: Path, times: Float64) -> NDArray[np.bool_]:
 
     Raises:
         InputError: a file that cannot be read, is malformed (the message names file and line) or
-            is for other frames; fewer than two tracked frames.
+            is for other frames.
     """
     reader = csv.DictReader(read_text(path, "frames").splitlines())
     if not set(_FRAME_COLUMNS) <= set(reader.fieldnames or ()):
@@ -247,8 +323,4 @@ def tracked_at(path: Path, times: Float64) -> NDArray[np.bool_]:
     if None in found:
         t = times[found.index(None)]
         raise InputError(f"{path} belongs to other frames: it has none at {t:.6f} s")
-    if sum(map(bool, found)) < 2:
-        raise InputError(
-            f"{path} leaves {sum(map(bool, found))} tracked poses; at least 2 are needed"
-        )
     return np.array(found, dtype=bool)

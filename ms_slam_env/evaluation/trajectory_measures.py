@@ -50,10 +50,11 @@ def measure_matched(matched: Matched, options: TrajectoryOptions) -> dict[str, A
         (None if the path is a line), ``rpe_m`` and ``rpe_rad``. Alignments other than SE(3) over
         all poses have the key of `absolute_key` instead of ``ate_m``. ``ate_printed_m`` and
         ``rpe_printed_m`` are those of `metrics.relative.printed_errors`. ``tracked_share`` and,
-        after SE(3), ``ate_tracked_m`` are given if it is known which frames were tracked. Further
-        entries: ``scale`` of the alignment, ``path_m``, ``duration_s``, ``pieces`` (the same
-        statistics by piece), ``drift_by_length`` (of sub-trajectories), robustness (USME equations
-        9 and 10 over gaps in time) and initialisation (12 and 13).
+        after SE(3), ``ate_tracked_m`` are given if it is known which frames were tracked;
+        ``covered_share`` of the truth's time has poses. Further entries: ``scale`` of the
+        alignment, ``path_m``, ``duration_s``, ``pieces`` (the same statistics by piece),
+        ``drift_by_length`` (of sub-trajectories), robustness (USME equations 9 and 10 over losses)
+        and initialisation (12 and 13).
 
     Raises:
         InputError: no two poses ``delta`` apart; more segments than poses.
@@ -63,6 +64,7 @@ def measure_matched(matched: Matched, options: TrajectoryOptions) -> dict[str, A
         "poses": count,
         "unmatched_poses": matched.unmatched,
         "tracked_share": matched.tracked_share,
+        "covered_share": matched.covered_share,
         "ate_tracked_m": _tracked_error(matched, options),
         "scale": matched.alignment.scale,
         "path_m": metrics.path_length(matched.truth),
@@ -158,6 +160,11 @@ def _relative(matched: Matched, part: slice, options: TrajectoryOptions) -> dict
     return found
 
 
+def relative_statistics(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
+    """Statistics of the relative errors over one spacing, ``rpe_m`` and ``rpe_rad`` by key."""
+    return _relative(matched, slice(None), options)
+
+
 def _relative_or_none(matched: Matched, part: slice, options: TrajectoryOptions) -> dict[str, Any]:
     """Relative errors; None for a piece too short to contain a pair of poses."""
     try:
@@ -178,30 +185,42 @@ def _as_printed(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
 
 
 def _robustness(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
-    """How well the pieces between time gaps fit together, USME equations (9) and (10)."""
-    lost_s = float(np.diff(matched.gaps, axis=1).sum())
-    duration = float(matched.times[-1] - matched.times[0])
+    """How well the pieces between losses fit together, USME equations (9) and (10).
+
+    Where it is not known which frames were tracked, a truth that goes on for longer than a gap
+    after the last pose leaves open whether the estimate was lost for good.
+    """
     breaks = np.flatnonzero(np.diff(matched.piece)) + 1
     # Each gap is represented by one untracked frame between the pieces.
     rows = np.insert(np.arange(len(matched.piece)), breaks, -1)
-    align = "sim3" if options.align == "sim3" else "se3"
+    rows = np.concatenate([[-1] * matched.lost_before, rows, [-1] * matched.lost_after]).astype(int)
+    ok = rows >= 0 if matched.tracked is None else (rows >= 0) & matched.tracked[rows]
+    lost_s = float(np.diff(matched.gaps, axis=1).sum())
     gaps = {
         "gaps": len(matched.gaps),
         "lost_s": lost_s,
-        "lost_time_share": lost_s / duration if duration > 0 else 0.0,
+        "lost_time_share": lost_s / matched.span_s if matched.span_s > 0 else 0.0,
     }
+    align = "sim3" if options.align == "sim3" else "se3"
+    reason, pieces = "", 0
     try:
-        found = metrics.tracking_robustness(
-            matched.raw[rows], matched.truth[rows], rows >= 0, align
-        )
+        found = metrics.tracking_robustness(matched.raw[rows], matched.truth[rows], ok, align)
+        reason, pieces = found.reason, len(found.segments)
     except InputError as error:
-        return {"robustness": None, "robustness_reason": str(error), "tracked_pieces": 0, **gaps}
+        reason = str(error)
+    if not reason and matched.tracked_share is None and matched.ends_early:
+        reason = (
+            f"the truth goes on for {matched.truth_after_s:.3f} s after the last pose, so the "
+            "estimate may have been lost for good; a frames.csv would tell"
+        )
+    if reason:
+        return {"robustness": None, "robustness_reason": reason, "tracked_pieces": pieces, **gaps}
     return {
         "robustness": found.error,
         "robustness_translation_m": found.translation_m,
         "robustness_rotation_rad": found.rotation_rad,
         "robustness_log_scale": found.log_scale,
-        "tracked_pieces": len(found.segments),
+        "tracked_pieces": pieces,
         **gaps,
     }
 

@@ -83,14 +83,25 @@ def indexed(points: ArrayLike | IndexedCloud, name: str) -> IndexedCloud:
     return points if isinstance(points, IndexedCloud) else IndexedCloud(points, name)
 
 
-def voxel_downsample(points: ArrayLike, voxel_m: float) -> Float64:
+ASKEW = np.array([0.618, 0.382, 0.754])
+"""Origin of a voxel grid, in voxels, that puts no plane at a round coordinate on a border.
+
+There, rounding alone decides on which side of the border a point lies, and the plane gets a point
+in both layers of voxels.
+"""
+
+
+def voxel_downsample(points: ArrayLike, voxel_m: float, origin: ArrayLike | None = None) -> Float64:
     """Keep the first point, in the given order, of each occupied voxel of side ``voxel_m``.
+
+    ``origin`` (3,) is a corner of the voxels, in voxels, (0, 0, 0) by default; see `ASKEW`.
 
     Raises:
         InputError: invalid points, or a voxel size that is not positive.
     """
     values = check_points(points, "points")
-    return values[voxel_firsts(values, voxel_m)]
+    placed = values if origin is None else values - voxel_m * np.asarray(origin)
+    return values[voxel_firsts(placed, voxel_m)]
 
 
 def voxel_firsts(points: ArrayLike, voxel_m: float) -> NDArray[np.int64]:

@@ -166,17 +166,43 @@ def statistical_inliers(
     return kept & (mean > middle - reach) if two_sided else kept
 
 
-def noise_ratio(
-    points: ArrayLike, neighbours: int = 20, std_ratio: float = 2.0, two_sided: bool = False
-) -> float:
-    """Share of ``points`` (N, 3) that `statistical_inliers` drops, USME equation (8): N_n / N_c.
+NOISE_SIGMAS = 3.0
+"""A point this many standard deviations off the surface is noise: 0.3 % of Gaussian errors are."""
+NOISE_SIGMA_M = 0.01
+"""Depth noise of a Kinect at 2.5 m (Nguyen et al. 2012), for maps whose sensor is not known."""
 
-    USME removes irrelevant points by eye; here the filter does it automatically.
+
+def noise_distance(truth: ArrayLike | IndexedCloud, sigma_m: float = NOISE_SIGMA_M) -> float:
+    """Distance in metres from ``truth`` (M, 3) beyond which a map point is noise.
+
+    ``NOISE_SIGMAS`` times the deviation expected of a right point: the sensor's depth noise
+    ``sigma_m`` and, as ``truth`` consists of samples, their `point_spacing`. It must not be
+    estimated from the map: a threshold that grows with the noise finds the same share in any map.
+
+    Raises:
+        InputError: bad points, fewer than 2, or a negative ``sigma_m``.
     """
-    return 1.0 - float(statistical_inliers(points, neighbours, std_ratio, two_sided).mean())
+    if not (np.isfinite(sigma_m) and sigma_m >= 0):
+        raise InputError(f"sigma_m must be finite and >= 0 m, got {sigma_m!r}")
+    return NOISE_SIGMAS * float(np.hypot(sigma_m, point_spacing(truth)))
 
 
-def point_spacing(points: ArrayLike) -> float:
+def noise_ratio(
+    points: ArrayLike, truth: ArrayLike | IndexedCloud, sigma_m: float = NOISE_SIGMA_M
+) -> float:
+    """Share of ``points`` (N, 3) farther than `noise_distance` from ``truth`` (M, 3).
+
+    USME equation (8), N_n / N_c: USME removes irrelevant points by eye and counts them; here those
+    that lie off the true surface are irrelevant. Without a true surface there is no such share: the
+    points that a filter drops from a cloud say nothing of its noise, as the filter's threshold
+    grows with it.
+    """
+    true_cloud = indexed(truth, "truth")
+    beyond = nearest_distances(points, true_cloud) > noise_distance(true_cloud, sigma_m)
+    return float(beyond.mean())
+
+
+def point_spacing(points: ArrayLike | IndexedCloud) -> float:
     """Mean distance in metres from a point (N, 3) to its nearest neighbour: how sparse a cloud is.
 
     USME uses the number of points for this, which grows with the mapped area.
@@ -184,12 +210,10 @@ def point_spacing(points: ArrayLike) -> float:
     Raises:
         InputError: bad points, or fewer than 2.
     """
-    from scipy.spatial import cKDTree
-
-    values = check_points(points, "points")
-    if len(values) < 2:
+    cloud = indexed(points, "points")
+    if len(cloud) < 2:
         raise InputError("the spacing of points needs at least 2")
-    return float(cKDTree(values).query(values, k=2)[0][:, 1].mean())
+    return float(cloud.tree.query(cloud.points, k=2)[0][:, 1].mean())
 
 
 def cloud_distance(points: ArrayLike, truth: ArrayLike) -> CloudDistance:

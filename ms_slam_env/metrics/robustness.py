@@ -31,20 +31,24 @@ class TrackingRobustness:
 
     Attributes:
         error: USME equation (10), the sum over neighbouring pieces of |log(xi_i^-1 xi_i+1)|;
-            metres, radians and, with scale, logarithms of scales are added without weights.
-        translation_m: sum of the translation parts.
-        rotation_rad: sum of the rotation parts.
-        log_scale: sum of the scale parts.
+            metres, radians and, with scale, logarithms of scales are added without weights. None
+            if some loss has no piece before or after it, which the sum would pass over: a system
+            that is lost for good has one piece and an empty sum.
+        translation_m: sum of the translation parts; None likewise.
+        rotation_rad: sum of the rotation parts; None likewise.
+        log_scale: sum of the scale parts; None likewise.
         segments: (K, 2) first frame and frame after the last of each piece.
         lost: share of the frames outside the pieces.
+        reason: why there is no error; empty if there is one.
     """
 
-    error: float
-    translation_m: float
-    rotation_rad: float
-    log_scale: float
+    error: float | None
+    translation_m: float | None
+    rotation_rad: float | None
+    log_scale: float | None
     segments: NDArray[np.int64]
     lost: float
+    reason: str = ""
 
 
 def tracked_segments(tracked: ArrayLike, shortest: int = 3) -> NDArray[np.int64]:
@@ -84,8 +88,8 @@ def tracking_robustness(
             piece and the rotation of a stationary one undetermined.
 
     Raises:
-        InputError: bad poses, lengths that differ, an unknown alignment, a negative lever, no
-            piece of at least 3 frames; ``sim3`` if estimate or truth stands still in a piece.
+        InputError: bad poses, lengths that differ, an unknown alignment, a negative lever;
+            ``sim3`` if estimate or truth stands still in a piece.
     """
     if align not in SEGMENT_ALIGNMENTS:
         raise unknown("alignment", align, SEGMENT_ALIGNMENTS)
@@ -98,8 +102,10 @@ def tracking_robustness(
             f"estimate has {len(poses)} poses, truth {len(true_poses)}, tracked "
             f"{len(np.asarray(tracked))} flags; they must correspond"
         )
-    if len(segments) == 0:
-        raise InputError("no piece of at least 3 frames was tracked")
+    covered = int((segments[:, 1] - segments[:, 0]).sum())
+    lost, reason = 1.0 - covered / len(poses), _unjoined_loss(segments, len(poses))
+    if reason:
+        return TrackingRobustness(None, None, None, None, segments, lost, reason)
     similarities = []
     for first, end in segments:
         own, true = poses[first:end], true_poses[first:end]
@@ -114,15 +120,23 @@ def tracking_robustness(
     parts = np.array(
         [similarity_log(np.linalg.inv(a) @ b) for a, b in itertools.pairwise(similarities)]
     ).reshape(-1, 7)
-    covered = int((segments[:, 1] - segments[:, 0]).sum())
     return TrackingRobustness(
         error=float(np.linalg.norm(parts, axis=1).sum()),  # (10)
         translation_m=float(np.linalg.norm(parts[:, :3], axis=1).sum()),
         rotation_rad=float(np.linalg.norm(parts[:, 3:6], axis=1).sum()),
         log_scale=float(np.abs(parts[:, 6]).sum()),
         segments=segments,
-        lost=1.0 - covered / len(poses),
+        lost=lost,
     )
+
+
+def _unjoined_loss(segments: NDArray[np.int64], frames: int) -> str:
+    """Which loss has no piece before or after it; empty if none."""
+    if len(segments) == 0:
+        return "no piece of at least 3 frames was tracked"
+    if segments[-1, 1] < frames:
+        return "no piece follows the last loss"
+    return "no piece precedes the first loss" if segments[0, 0] > 0 else ""
 
 
 def similarity_log(S: ArrayLike) -> Float64:

@@ -66,7 +66,7 @@ _OF_KINDS = {
 }
 """Results of commands that use few parts."""
 
-_OUTPUT = ("tables", "charts", "write_pictures", "about", "title")
+_OUTPUT = ("tables", "charts", "about", "title")
 """Methods of an experiment that only present its rows."""
 
 _DATA = (".xml", ".yaml")

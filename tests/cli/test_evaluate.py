@@ -21,7 +21,7 @@ from ms_slam_env import metrics
 from ms_slam_env.camera import xtion
 from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
-from ms_slam_env.evaluation.map_files import evaluate_maps
+from ms_slam_env.evaluation.map_files import MapOptions, evaluate_maps
 from ms_slam_env.evaluation.run_files import write_ply
 from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions
 from ms_slam_env.evaluation.trajectory_measures import absolute_key, evaluate_files, statistic_keys
@@ -289,10 +289,51 @@ def test_frames_that_a_run_lost_are_gaps(tmp_path: Path) -> None:
     assert result["poses"] == COUNT - 4
     assert result["tracked_share"] == everything["tracked_share"] == pytest.approx(1 - 4 / COUNT)
     assert result["ate_max_m"] < 1e-6
-    robustness = result
-    assert (robustness["gaps"], robustness["tracked_pieces"]) == (2, 3)
-    assert robustness["lost_s"] == pytest.approx(4 * 0.05 + 2 * 0.05)
-    assert robustness["robustness"] == pytest.approx(0, abs=1e-6)
+    for robustness in (result, everything):  # beside the estimate it needs no option
+        assert (robustness["gaps"], robustness["tracked_pieces"]) == (2, 3)
+        assert robustness["lost_s"] == pytest.approx(4 * 0.05 + 2 * 0.05)
+        assert robustness["covered_share"] == pytest.approx(1 - 6 / (COUNT - 1), abs=1e-3)
+        assert robustness["robustness"] == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("how", ["beside", "asked", "poses that end"])
+def test_an_estimate_lost_for_good_has_no_robustness(
+    how: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pair, tracked = write_pair(tmp_path, noise=0.0), 12
+    times, poses = read_trajectory(pair[0])
+    if how == "poses that end":
+        write_trajectory(pair[0], times[:tracked], poses[:tracked])
+    else:
+        poses[tracked:] = poses[tracked - 1]
+        write_trajectory(pair[0], times, poses)
+        rows = [f"{t:.6f},{int(k < tracked)}" for k, t in enumerate(times)]
+        (tmp_path / "frames.csv").write_text("\n".join(["timestamp,tracking_ok", *rows]))
+    option = ["--frames", str(tmp_path / "frames.csv")] if how == "asked" else []
+    result = evaluate([*pair, *option], tmp_path / "out")
+    assert (result["robustness"], result["tracked_pieces"]) == (None, 1)
+    assert result["covered_share"] == pytest.approx((tracked - 1) / (COUNT - 1), abs=1e-3)
+    if how != "poses that end":
+        assert result["gaps"] == 1
+        assert result["lost_time_share"] == pytest.approx(1 - (tracked - 1) / (COUNT - 1))
+    reason = {"poses that end": "the truth goes on for 5.397 s after the last pose"}
+    said = reason.get(how, "no piece follows the last loss")
+    assert result["robustness_reason"].startswith(said)
+    shown = capsys.readouterr().out
+    assert f"robustness error not available: {said}" in shown
+    assert "(9 % of the truth's time)" in shown
+    assert said in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_an_estimate_lost_from_the_second_frame_is_not_whole(tmp_path: Path) -> None:
+    pair = write_pair(tmp_path, noise=0.0)
+    times, _ = read_trajectory(pair[0])
+    rows = [f"{t:.6f},{int(k == 0)}" for k, t in enumerate(times)]
+    (tmp_path / "frames.csv").write_text("\n".join(["timestamp,tracking_ok", *rows]))
+    result = evaluate_files(*map(Path, pair))
+    assert (result["robustness"], result["tracked_pieces"]) == (None, 0)
+    assert result["tracked_share"] == pytest.approx(1 / COUNT)
+    assert result["covered_share"] == 0.0
 
 
 def test_frames_beside_the_estimate_say_what_was_tracked(
@@ -307,7 +348,7 @@ def test_frames_beside_the_estimate_say_what_was_tracked(
     frames.write_text("\n".join(["timestamp,tracking_ok", *rows]))
     capsys.readouterr()
     result = evaluate(pair, tmp_path / "out")
-    assert (result["poses"], result["tracked_share"], result["gaps"]) == (COUNT, 0.75, 0)
+    assert (result["poses"], result["tracked_share"], result["gaps"]) == (COUNT, 0.75, COUNT // 4)
     assert result["ate_tracked_m"] == pytest.approx(metrics.ate_rmse(poses[ok], truth[ok]))
     assert result["ate_m"] == pytest.approx(metrics.ate_rmse(poses, truth))
     said = capsys.readouterr().out
@@ -418,13 +459,43 @@ def test_maps_by_their_measures(maps: list[str], tmp_path: Path) -> None:
         "completion_cm": metrics.completion(points, surface).completion_cm,
         "c2c_rms_m": metrics.cloud_distance(points, surface).rms,
         "hausdorff_m": metrics.hausdorff_distance(points, surface),
-        "noise_ratio": metrics.noise_ratio(points),
+        "noise_ratio": metrics.noise_ratio(points, surface),
+        "noise_beyond_m": 3 * np.hypot(0.01, metrics.point_spacing(surface)),
         "spacing_m": metrics.point_spacing(points),
     }
     for name, value in expected.items():
         assert result[name] == pytest.approx(value, abs=1e-12), name
     assert result["hausdorff_m"] > 3
     np.testing.assert_array_equal(result["T_true_map"], np.eye(4))
+
+
+@pytest.mark.parametrize("kind", ["mesh", "cloud"])
+def test_a_plane_on_the_border_of_voxels_counts_once(kind: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    found = []
+    for jitter in (0.0, 1e-7):
+        plates = [trimesh.creation.box(extents=[2.0, 2.0, 0.0]) for _ in range(2)]
+        plates[1].apply_translation([0, 0, 1.0025])
+        corners = np.concatenate([plate.vertices[[0, 2, 6, 4]] for plate in plates])
+        faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+        true = trimesh.Trimesh(corners, faces, process=False)
+        if kind == "cloud":
+            points, _ = trimesh.sample.sample_surface(true, 40_000, seed=0)
+            points = np.asarray(points) + rng.uniform(-jitter, jitter, (40_000, 3))
+            write_ply(tmp_path / "true.ply", points, {})
+        else:
+            true.vertices = true.vertices + rng.uniform(-jitter, jitter, true.vertices.shape)
+            true.export(tmp_path / "true.obj", digits=12)
+        lower = np.column_stack([rng.uniform(-1, 1, (20_000, 2)), np.zeros(20_000)])
+        lower[:, 2] += rng.uniform(-jitter, jitter, len(lower))
+        write_ply(tmp_path / "map.ply", lower, {})
+        truth = tmp_path / ("true.ply" if kind == "cloud" else "true.obj")
+        options = MapOptions(voxel_m=0.05, samples=20_000)
+        found.append(evaluate_maps(tmp_path / "map.ply", truth, options)[0])
+    for one in found:
+        assert one["completion_ratio"] == pytest.approx(0.5, abs=0.02)
+        assert one["completion_cm"] == pytest.approx(51.3, abs=2)
+    assert found[0]["accuracy_cm"] == pytest.approx(found[1]["accuracy_cm"], rel=0.01)
 
 
 @pytest.mark.parametrize("method", ["icp", "plane-icp", "gicp"])
@@ -437,7 +508,9 @@ def test_registered_maps_lie_where_they_belong(
     assert result["registration_share"] > 0.99
     assert result["hausdorff_directed_m"] < 0.05
     assert result["precision_2cm"] > 0.9  # points of either surface are 17 mm apart
-    assert result["noise_ratio"] == pytest.approx(10 / 20_010)
+    assert result["outlier_share"] == pytest.approx(10 / 20_010)
+    far = 10 / (result["compared_points"] + 10)  # one a voxel, with those that were removed
+    assert result["noise_ratio"] == pytest.approx(far)
 
 
 def test_a_sequence_stands_for_the_surface_that_it_saw(tmp_path: Path) -> None:

@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist, directed_hausdorff
+from scipy.stats import norm
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.metrics import (
     cloud_distance,
     hausdorff_distance,
+    noise_distance,
     noise_ratio,
     point_spacing,
     statistical_inliers,
@@ -49,13 +51,31 @@ def test_two_sided_removal_drops_what_lies_too_close_as_well() -> None:
     assert one_sided[400:440].all()
     assert not found[400:440].any()
     assert not one_sided[440]
-    assert noise_ratio(points, 10, 0.3, two_sided=True) == 1 - found.mean()
 
 
-def test_noise_ratio_is_the_share_of_far_points() -> None:
-    grid = np.stack(np.meshgrid(*[np.arange(10.0)] * 3), -1).reshape(-1, 3)
-    far = 100.0 * np.arange(1, 6)[:, None] * np.ones(3)
-    assert noise_ratio(np.concatenate([grid, far]), 8) == pytest.approx(5 / 1005)
+def test_noise_ratio_is_the_share_of_points_off_the_surface() -> None:
+    plane = 0.01 * np.stack(np.meshgrid(np.arange(300.0), np.arange(300.0), [0.0]), -1)
+    plane = plane.reshape(-1, 3)
+    assert noise_distance(plane, 0.02) == pytest.approx(3 * np.hypot(0.02, 0.01))
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(0.5, 2.5, (100_000, 2)), rng.normal(0, 0.05, 100_000)])
+    limit = noise_distance(plane, 0.01)
+    # The nearest sample is up to a grid cell's half aside, so the share lies between two bounds.
+    low, high = (2 * norm.sf(np.sqrt(limit**2 - s**2) / 0.05) for s in (0.0, 0.005 * np.sqrt(2)))
+    assert low - 0.005 < noise_ratio(points, plane, 0.01) < high + 0.005
+    assert noise_ratio(np.concatenate([plane, plane[:100] + 5.0]), plane) == 100 / 90_100
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.0, 0.03))
+def test_noise_ratio_never_falls_with_the_noise(seed: int, sensor_m: float) -> None:
+    rng = np.random.default_rng(seed)
+    plane = np.column_stack([rng.uniform(0, 2, (5000, 2)), np.zeros(5000)])
+    error = np.column_stack([np.zeros((5000, 2)), rng.standard_normal(5000)])
+    ratios = [noise_ratio(plane + s * error, plane, sensor_m) for s in (0.0, 0.005, 0.05, 0.3)]
+    assert ratios == sorted(ratios)
+    assert ratios[0] == 0
+    assert ratios[3] > 0.5
 
 
 def test_spacing_of_a_grid() -> None:
@@ -90,7 +110,9 @@ def test_distance_of_a_shifted_plane() -> None:
         (lambda: point_spacing(cloud(0, 1)), "at least 2"),
         (lambda: hausdorff_distance(np.zeros((0, 3)), cloud(0)), "points is empty"),
         (lambda: cloud_distance(np.full((3, 3), np.nan), cloud(0)), "not finite"),
-        (lambda: noise_ratio(np.zeros((9, 2))), r"must be \(N, 3\)"),
+        (lambda: noise_ratio(np.zeros((9, 2)), cloud(0)), r"must be \(N, 3\)"),
+        (lambda: noise_ratio(cloud(0), cloud(0, 1)), "at least 2"),
+        (lambda: noise_ratio(cloud(0), cloud(1), -1.0), "sigma_m must be finite and >= 0 m"),
     ],
 )
 def test_bad_input(call, message: str) -> None:

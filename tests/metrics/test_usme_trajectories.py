@@ -80,6 +80,42 @@ def test_a_common_world_costs_nothing_and_neither_does_the_choice_of_it() -> Non
     assert tracking_robustness(poses, poses, np.ones(60, bool)).error == 0  # one piece
 
 
+@pytest.mark.parametrize(
+    ("lost", "pieces", "share", "reason"),
+    [
+        (TIMES >= 0.3, 1, 57 / 60, "no piece follows the last loss"),  # held from then on
+        (TIMES < 5.7, 1, 57 / 60, "no piece precedes the first loss"),
+        (LOST | (TIMES >= 4), 2, 25 / 60, "no piece follows the last loss"),
+        (LOST | (TIMES >= 5.75), 2, 7 / 60, "no piece follows the last loss"),
+        (TIMES >= 0.2, 0, 1.0, "no piece of at least 3 frames was tracked"),
+        (TIMES >= 0, 0, 1.0, "no piece of at least 3 frames was tracked"),
+    ],
+)
+def test_a_loss_for_good_has_no_error_instead_of_none(
+    lost: np.ndarray, pieces: int, share: float, reason: str
+) -> None:
+    poses = winding()
+    held = np.maximum.accumulate(np.where(lost, 0, np.arange(60)))
+    found = tracking_robustness(poses[held], poses, ~lost)
+    parts = (found.error, found.translation_m, found.rotation_rad, found.log_scale)
+    assert parts == (None,) * 4
+    assert (len(found.segments), found.reason) == (pieces, reason)
+    assert found.lost == pytest.approx(share)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.booleans(), min_size=1, max_size=40))
+def test_an_error_means_that_every_loss_was_joined(flags: list[bool]) -> None:
+    ok, poses = np.array(flags), winding(len(flags))
+    found = tracking_robustness(poses, poses, ok)
+    inside = np.zeros(len(ok), bool)
+    for first, end in found.segments:
+        inside[first:end] = True
+    joined = len(found.segments) > 0 and inside[0] and inside[-1]
+    assert (found.error is not None) == joined == (found.reason == "")
+    assert found.lost == pytest.approx(1 - inside.mean())
+
+
 def test_no_poses_are_no_trajectory() -> None:
     with pytest.raises(InputError, match="estimate"):
         tracking_robustness(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), [])
@@ -200,7 +236,6 @@ def test_time_and_way_of_a_team() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: tracking_robustness(winding(), winding(), np.zeros(60, bool)), "no piece"),
         (lambda: tracking_robustness(winding(), winding(), np.ones(60)), "bool"),
         (lambda: tracking_robustness(winding(), winding(9), np.ones(60, bool)), "correspond"),
         (lambda: tracking_robustness(winding(), winding(), ~LOST, align="x"), "se3, sim3"),

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from ms_slam_docs.markdown_pages import with_tables
 
 from ms_slam_env.benchmark.rows import run_all
 from ms_slam_env.errors import InputError
 from ms_slam_env.report import sources
-from ms_slam_env.report.markdown_pages import with_tables
 from ms_slam_env.report.results import read_results, write_results
 from ms_slam_env.report.sources import PARTS, changed_parts, digest_of, joined, sources_of
 from ms_slam_env.report.tables import make_table

@@ -57,7 +57,8 @@ def test_axial_noise_is_that_of_nguyen(z: float, quantised: bool) -> None:
     step = 0.125 if quantised else 0.0
     sensor = wall_sensor(replace(NoNoise(), axial=1.0, disparity_step_px=step))
     depths = [sensor.capture(at_distance(z), index).depth[30:90, 40:120] for index in range(5)]
-    sigma = 0.0012 + 0.0019 * (z - 0.4) ** 2
+    sigma = sensor.noise.depth_sigma_m(z)
+    assert sigma == pytest.approx(0.0012 + 0.0019 * (z - 0.4) ** 2)
     # About one fixed depth the steps do not average out, hence the wider margin.
     assert np.std(depths) == pytest.approx(sigma, rel=0.15 if quantised else 0.02)
     assert np.mean(depths) == pytest.approx(z, abs=0.1 * sigma if not quantised else sigma)
