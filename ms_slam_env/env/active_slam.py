@@ -64,8 +64,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     Option ``observation``: ``features`` (vector: state, grey histogram, coarse depth, action mask),
     ``lookahead`` (features and the predicted divergences of every action), ``map`` (features and
     the occupancy around the camera), ``goals``, ``held`` and ``candidates`` (state, and the values
-    by which the planners rank every action), ``pixels`` (a vector of state and small images) or
-    ``rgbd`` (images and state). All show only what the robot itself knows; see
+    by which the planners rank every action), ``pixels`` (a vector of state and small images),
+    ``images`` (colour and depth as one uint8 image, and state) or ``rgbd`` (both as measured, and
+    state). All show only what the robot itself knows; see
     :mod:`ms_slam_env.env.observations`. Where the agent chooses the SLAM configuration, the current
     one is added one-hot (K,): at the end of the vector, or as ``slam_configuration``.
 

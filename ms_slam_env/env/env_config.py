@@ -103,8 +103,8 @@ class EnvConfig(Checked):
             pose of a dropped frame is predicted; its surface is not mapped.
         slam_config: options of the backend, or a configuration file (YAML), which also sets
             ``slam``, and ``image_size`` where that is not given.
-        observation: ``rgbd``, ``pixels``, ``features``, ``lookahead``, ``map``, ``goals``,
-            ``held``, ``candidates``, ``module:Class`` or a class.
+        observation: ``rgbd``, ``images``, ``pixels``, ``features``, ``lookahead``, ``map``,
+            ``goals``, ``held``, ``candidates``, ``module:Class`` or a class.
         step_m: translation of a motion, metres.
         step_rad: rotation of a motion, radians.
         frames_per_action: frames that a free camera takes per motion, at 30 Hz; an arm takes as

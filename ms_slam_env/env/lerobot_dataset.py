@@ -52,9 +52,9 @@ class Steps:
         """Columns by LeRobot's names: images (N, H, W, 3) uint8, all others (N, k)."""
         last = slice(None, -1)
         images = {f"observation.images.{k}": v[last] for k, v in self.observations.items()
-                  if v.ndim == 4}  # fmt: skip
+                  if v.shape[3:] == (3,)}  # fmt: skip
         seen = {f"observation.{k or 'state'}": v[last] for k, v in self.observations.items()
-                if v.ndim < 4}  # fmt: skip
+                if v.shape[3:] != (3,)}  # fmt: skip
         known = {f"info.{k}": v[last] for k, v in self.infos.items()}
         after = {
             "next.reward": np.asarray(self.rewards, np.float32),
