@@ -61,7 +61,10 @@ class Steps:
             "next.done": np.asarray(self.terminated) | np.asarray(self.truncated),
             "next.truncated": np.asarray(self.truncated),
         }
-        rows = {**seen, "action": np.asarray(self.actions, np.int64), **after, **known}
+        actions = np.asarray(self.actions)
+        if actions.dtype.kind != "f":
+            actions = actions.astype(np.int64)
+        rows = {**seen, "action": actions, **after, **known}
         return images | {name: value.reshape(len(value), -1) for name, value in rows.items()}
 
 

@@ -68,8 +68,11 @@ def test_the_checker_of_stable_baselines3_finds_nothing(env_id):
     assert {name for name, warned in found.items() if warned} == set()
 
 
+OTHERS = (*ms_slam_env.TASK_IDS, *ms_slam_env.CONTINUOUS_IDS, *ms_slam_env.PERTURBED_ENV_IDS)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("env_id", [*ms_slam_env.TASK_IDS, *ms_slam_env.PERTURBED_ENV_IDS])
+@pytest.mark.parametrize("env_id", OTHERS)
 def test_the_checker_finds_nothing_with_images(env_id):
     assert checked(env_id, "images") == []
 
