@@ -21,7 +21,7 @@ def test_the_examples_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
     monkeypatch.chdir(tmp_path)
     assert {language for language, _ in BLOCKS} == {"python", "sh"}  # no other spelling of Python
     sources = [source for language, source in BLOCKS if language == "python"]
-    assert len(sources) == 13
+    assert len(sources) == 14
     names: dict[str, Any] = {}
     for source in sources:
         small = re.sub(r"^OPTIONS = .*$", SMALL, source, flags=re.MULTILINE)
