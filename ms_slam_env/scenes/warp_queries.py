@@ -4,10 +4,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.warp import wp
+from ms_slam_env._runtime.warp import kernel_wp as wp
 
 
 @wp.kernel
@@ -41,7 +43,9 @@ class WarpScene:
         self, origins: NDArray[np.float32], directions: NDArray[np.float32], output: int = 1
     ) -> dict[str, NDArray[np.generic]]:
         """Return ``tfar`` and ``primID`` (N,) of rays (N, 3); ``primID`` is -1 without a hit."""
-        rays = [wp.array(rows, dtype=wp.vec3, device="cpu") for rows in (origins, directions)]
+        rays: list[Any] = [
+            wp.array(rows, dtype=wp.vec3, device="cpu") for rows in (origins, directions)
+        ]
         t = wp.zeros(len(origins), dtype=wp.float32, device="cpu")
         face = wp.zeros(len(origins), dtype=wp.int32, device="cpu")
         inputs = [self._mesh.id, *rays, t, face]
