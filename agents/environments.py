@@ -159,6 +159,11 @@ def _spaces_in(args: Problem, split: str) -> tuple[Any, Any]:
             f"observation {args.observation!r} has several parts, which no trainer takes; "
             "'pixels' has its images, smaller, in one vector"
         )
+    if isinstance(env.action_space, gym.spaces.Box):
+        raise InputError(
+            f"the actions of {args.env_id!r} are continuous, which no trainer takes; "
+            "docs/rl.md shows how to train with your own code"
+        )
     return env.observation_space, env.action_space
 
 

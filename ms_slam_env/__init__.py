@@ -2,6 +2,7 @@
 
 from ms_slam_env.gym_ids import (
     BATCHED_IDS,
+    CONTINUOUS_IDS,
     ENV_IDS,
     PERTURBED_ENV_IDS,
     TASK_IDS,
@@ -12,4 +13,11 @@ __version__ = "0.1.0"
 
 register_all()
 
-__all__ = ["BATCHED_IDS", "ENV_IDS", "PERTURBED_ENV_IDS", "TASK_IDS", "__version__"]
+__all__ = [
+    "BATCHED_IDS",
+    "CONTINUOUS_IDS",
+    "ENV_IDS",
+    "PERTURBED_ENV_IDS",
+    "TASK_IDS",
+    "__version__",
+]

@@ -51,14 +51,14 @@ class Checked:
             if field.type in (bool, "bool"):
                 _check_bool(self, field.name)
             may_be_none = "None" in str(field.type) and getattr(self, field.name) is None
-            limits = _limits(type(self), field.name)
+            limits = limits_of(type(self), field.name)
             if _RANGE in limits and not may_be_none:
                 check_range(self, field.name, *limits[_RANGE])
             if _CHOICES in limits and not may_be_none:
                 check_choice(self, field.name, limits[_CHOICES])
 
 
-def _limits(cls: type, name: str) -> Mapping[Any, Any]:
+def limits_of(cls: type, name: str) -> Mapping[Any, Any]:
     """Range or choices of a field; an override that changes only the default inherits them."""
     stated = (getattr(base, "__dataclass_fields__", {}).get(name) for base in cls.__mro__)
     return next((field.metadata for field in stated if field and field.metadata), {})

@@ -66,6 +66,12 @@ TASK_IDS = tuple(_TASKS)
 """The benchmark tasks, each with its scenes, options and episode length."""
 
 
+CONTINUOUS_IDS = tuple(
+    name.replace("-v0", "-Continuous-v0")
+    for name in ("MSActiveSLAM-v0", "MSActiveSLAM-FreeCamera-v0", *TASK_IDS)
+)
+"""Those whose actions are points of a box: ``actions="continuous"``."""
+
 BATCHED_IDS = tuple(f"batched/{name}" for name in ("MSActiveSLAM-FreeCamera-v0", env_id_of("room")))
 """Those that ``gym.make_vec`` also steps all at once.
 
@@ -80,6 +86,10 @@ def register_all() -> None:
         _register(env_id, MAX_EPISODE_STEPS, arguments)
     for env_id, (name, task) in _TASKS.items():
         _register(env_id, task.steps, {**_ARGUMENTS[task.env_id], "task": name})
+    for env_id in CONTINUOUS_IDS:
+        discrete = gymnasium.spec(env_id.replace("-Continuous", ""))
+        steps = discrete.max_episode_steps or MAX_EPISODE_STEPS
+        _register(env_id, steps, {**discrete.kwargs, "actions": "continuous"})
     for batched_id in BATCHED_IDS:
         if batched_id not in gymnasium.registry:
             single = gymnasium.spec(batched_id.removeprefix("batched/"))

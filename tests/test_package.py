@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zipfile
 from importlib.metadata import (
+    Distribution,
     PackageNotFoundError,
     distribution,
     entry_points,
@@ -18,16 +19,16 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+import ms_slam_env
 from ms_slam_env.cli.experiment import ELSEWHERE
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
-    """The wheel built from the tracked sources, without the network."""
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a wheel is built from."""
     source = tmp_path_factory.mktemp("source")
-    out = tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         (source / name).write_bytes((ROOT / name).read_bytes())
     for folder in ("ms_slam_env", "agents", "baselines", "experiments", "docs/site"):
@@ -36,6 +37,13 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
                 target = source / path.relative_to(ROOT)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(path.read_bytes())
+    return source
+
+
+@pytest.fixture(scope="module")
+def wheel(source: Path, tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    """The wheel built from the tracked sources, without the network."""
+    out = tmp_path_factory.mktemp("wheel")
     code = f"from setuptools import build_meta; build_meta.build_wheel({str(out)!r})"
     subprocess.run([sys.executable, "-c", code], cwd=source, check=True, capture_output=True)
     return zipfile.ZipFile(next(out.glob("*.whl")))
@@ -61,6 +69,42 @@ from ms_slam_env.cli import main; main(["experiment", "list"])"""
     _, *names, empty, said = done.stdout.splitlines()[1:]
     assert [line.split()[0] for line in names] == ["compare", "planners", "usme"], done.stderr
     assert (empty, said) == ("", ELSEWHERE)
+
+
+REPOSITORY = "https://forge.test/owner/name"
+
+
+@pytest.mark.parametrize("url", ["", REPOSITORY, f"{REPOSITORY}/"])
+def test_an_index_page_has_no_dead_links(source: Path, tmp_path: Path, url: str) -> None:
+    """Those of README.md lead to files of the repository, or are text where it has no address."""
+    code = f"""from setuptools import build_meta
+print(build_meta.prepare_metadata_for_build_wheel({str(tmp_path)!r}))"""
+    env = {**os.environ, "MS_SLAM_ENV_URL": url}
+    subprocess.run([sys.executable, "-c", code], cwd=source, env=env, check=True)
+    (folder,) = tmp_path.glob("*.dist-info")
+    shown = Distribution.at(folder).metadata
+    assert shown["Description-Content-Type"] == "text/markdown"
+    assert {"Typing :: Typed", "Operating System :: POSIX :: Linux"} <= set(
+        shown.get_all("Classifier")
+    )
+    text = str(shown.get_payload())
+    readme = (ROOT / "README.md").read_text()
+    own = re.findall(r"\]\((?!https?:)([^)#]+)", readme)
+    assert len(own) > 20
+    targets = re.findall(r"\]\(([^)#]+)", text)
+    assert [target for target in targets if not target.startswith("https://")] == []
+    there = [target for target in targets if target.startswith(REPOSITORY)]
+    places = dict(line.split(", ") for line in shown.get_all("Project-URL") or ())
+    if not url:
+        assert (there, places) == ([], {})
+        assert "[SLAM]" not in text
+        return
+    assert [re.sub(rf"{REPOSITORY}/(raw|blob)/HEAD/", "", target) for target in there] == own
+    assert f"({REPOSITORY}/raw/HEAD/docs/pictures/home.webp)" in text
+    assert places["Homepage"] == REPOSITORY
+    files = [place.partition("/blob/HEAD/")[2] for place in places.values() if "/blob/" in place]
+    assert files
+    assert [name for name in (*own, *files) if not (ROOT / name).is_file()] == []
 
 
 def test_wheel_takes_no_general_names(wheel: zipfile.ZipFile) -> None:
@@ -161,6 +205,26 @@ def test_after_a_base_install_the_shipped_agents_run() -> None:
     assert done.stdout.split() == ["agent-home", "agent-paper", "agent-ppo", "agent-room"]
 
 
+@pytest.mark.parametrize(
+    ("system", "machine", "wanted"),
+    [
+        ("linux", "x86_64", True),
+        ("linux", "aarch64", False),
+        ("darwin", "arm64", True),
+        ("win32", "AMD64", True),
+    ],
+)
+def test_embreex_is_asked_for_where_it_has_a_wheel(
+    wheel: zipfile.ZipFile, system: str, machine: str, wanted: bool
+) -> None:
+    name = next(name for name in wheel.namelist() if name.endswith("METADATA"))
+    asked = re.findall(r"^Requires-Dist: (embreex.*)$", wheel.read(name).decode(), re.MULTILINE)
+    (embreex,) = map(Requirement, asked)
+    assert embreex.marker is not None
+    here = {"sys_platform": system, "platform_machine": machine, "extra": ""}
+    assert embreex.marker.evaluate(here) == wanted
+
+
 def test_constraints_are_versions_only() -> None:
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     wrong = [line for line in lines if not re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line)]
@@ -177,6 +241,34 @@ def test_constraints_cover_every_declared_dependency() -> None:
         requirement = Requirement(text)
         assert normal(requirement.name) in pinned
         assert requirement.specifier.contains(pinned[normal(requirement.name)])
+
+
+def test_there_is_one_version() -> None:
+    files = ("pyproject.toml", "ms_slam_env/__init__.py", "CITATION.cff", "CHANGELOG.md")
+    forms = (r'^version = "(.*)"$', r'^__version__ = "(.*)"$', r"^version: (.*)$", r"^## \[(.*)\]")
+    found = [
+        re.findall(form, (ROOT / name).read_text(), re.MULTILINE)[0]
+        for name, form in zip(files, forms, strict=True)
+    ]
+    assert set(found) == {ms_slam_env.__version__}
+
+
+def test_an_id_after_the_packages_name_needs_no_import() -> None:
+    """As scripts make them that know nothing of the package; `register_envs` asks for no more."""
+    code = """import sys, gymnasium as gym
+assert "ms_slam_env" not in sys.modules
+env_id, options = "MSActiveSLAM-FreeCamera-v0", {"scene": "table", "image_size": "80x60"}
+env = gym.make(f"ms_slam_env:{env_id}", **options)
+envs = gym.make_vec(f"ms_slam_env:{env_id}", num_envs=1, vectorization_mode="async", **options)
+import ms_slam_env
+before = dict(gym.registry)
+gym.register_envs(ms_slam_env)
+assert gym.registry == before
+print(env.spec.id, env.reset(seed=0)[0].shape, envs.reset(seed=0)[0].shape)
+envs.close()"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    said = "MSActiveSLAM-FreeCamera-v0 (189,) (1, 189)\n"
+    assert (done.stdout, done.returncode) == (said, 0), done.stderr[-2000:]
 
 
 def test_ci_runs_the_tests() -> None:

@@ -33,10 +33,10 @@ from ms_slam_env.report.provenance import provenance
 _STREAM = 2  # of an episode's seed, for the planner; the environment draws from the seed itself
 _VARIABLE = "MINARI_DATASETS_PATH"
 _INFOS = (
-    *("action_mask", "tracking_ok", "T_world_camera", "T_world_camera_estimate"),
+    *("action_mask", "travelled", "tracking_ok", "T_world_camera", "T_world_camera_estimate"),
     *("divergence", "pose_error", "mapped_share"),
 )
-"""Keys of ``info`` recorded at every step."""
+"""Keys of ``info`` recorded at every step, where it has them."""
 
 _OWN_OPTIONS = ("scene", "split", "num_scene_seeds", "observation")
 _MARKERS = {"minari": "data/metadata.json", "lerobot": "meta/info.json"}
@@ -247,7 +247,8 @@ def _play(env: gym.Env[Any, Any], args: Args, seed: int) -> Steps:
     by_part = (
         {k: np.array([each[k] for each in seen]) for k in seen[0]} if _has_parts(env) else None
     )
-    infos = {key: np.array([each[key] for each in known]) for key in _INFOS}
+    keys = [key for key in _INFOS if key in info]
+    infos = {key: np.array([each[key] for each in known]) for key in keys}
     return Steps(by_part or {"": np.array(seen)}, infos, *map(np.array, zip(*steps, strict=True)))
 
 

@@ -1,4 +1,4 @@
-"""Actions: a motion, or a motion and the SLAM configuration for its frames."""
+"""Discrete actions: a motion, or a motion and the SLAM configuration for its frames."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ms_slam_env._runtime.arrays import Bool
+from ms_slam_env._runtime.arrays import Bool, Float64
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.adaptation import AdaptationConfig, AdaptiveSlam, AgentConfig
 from ms_slam_env.slam.slam_backend import SlamBackend
@@ -52,8 +52,10 @@ class ActionDecoder(ABC):
     num_configurations: int = 1
 
     @abstractmethod
-    def decode(self, action: Any) -> int:
-        """Apply the action's SLAM configuration, if any; return the index of its motion.
+    def decode(self, action: Any) -> int | Float64:
+        """Apply the action's SLAM configuration, if any; return its motion.
+
+        An index, or where actions are continuous a twist (6,) in units of a step.
 
         Raises:
             InputError: not an action of ``space``.
@@ -61,7 +63,11 @@ class ActionDecoder(ABC):
 
     @abstractmethod
     def masks(self, motion_masks: Bool) -> Bool:
-        """Which actions are possible, given which motions are (``motion_masks``, (n,))."""
+        """Which actions are possible, given which motions are (``motion_masks``, (n,)).
+
+        Raises:
+            InputError: the actions have no mask.
+        """
 
     @property
     def configuration(self) -> int:
@@ -83,7 +89,7 @@ class MotionActions(ActionDecoder):
 
     def decode(self, action: Any) -> int:
         """See the base class."""
-        array = _as_array(action)
+        array = as_array(action)
         is_integer = array.shape == () and np.issubdtype(array.dtype, np.integer)
         if not is_integer or not 0 <= int(array) < self.num_motions:
             raise InputError(f"action {action!r} is not an integer in [0, {self.num_motions - 1}]")
@@ -118,7 +124,7 @@ class MotionAndConfigurationActions(ActionDecoder):
 
     def decode(self, action: Any) -> int:
         """See the base class; the configuration is in force from the next frame on."""
-        array = _as_array(action)
+        array = as_array(action)
         if array.shape != (2,) or array not in self.space:
             sizes = " x ".join(f"[0, {n - 1}]" for n in self.space.nvec)
             raise InputError(f"action {action!r} is not two integers in {sizes}")
@@ -140,7 +146,7 @@ class MotionAndConfigurationActions(ActionDecoder):
         return self._costs[self.configuration]
 
 
-def _as_array(action: Any) -> NDArray[Any]:
+def as_array(action: Any) -> NDArray[Any]:
     """Convert an action to an array; ragged lists become one that is no valid action."""
     try:
         return np.asarray(action)

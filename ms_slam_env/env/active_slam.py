@@ -59,13 +59,17 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     configurations, from fast to robust, processes its frames: run-time adaptation (section V-B)
     decided by the agent. The mask has 49 + K entries, motions first, as sb3-contrib's MaskablePPO
     expects; every configuration is always possible.
+    ``actions="continuous"`` (``MSActiveSLAM-Continuous-v0``): ``Box(-1, 1, (6,))``, a translation
+    in units of ``step_m`` and a rotation vector in units of ``step_rad``, along and about the same
+    axes. There are no masks: a motion that is blocked stops short.
 
     ## Observation space
     Option ``observation``: ``features`` (vector: state, grey histogram, coarse depth, action mask),
     ``lookahead`` (features and the predicted divergences of every action), ``map`` (features and
     the occupancy around the camera), ``goals``, ``held`` and ``candidates`` (state, and the values
-    by which the planners rank every action), ``pixels`` (a vector of state and small images) or
-    ``rgbd`` (images and state). All show only what the robot itself knows; see
+    by which the planners rank every action), ``pixels`` (a vector of state and small images),
+    ``images`` (colour and depth as one uint8 image, and state) or ``rgbd`` (both as measured, and
+    state). All show only what the robot itself knows; see
     :mod:`ms_slam_env.env.observations`. Where the agent chooses the SLAM configuration, the current
     one is added one-hot (K,): at the end of the vector, or as ``slam_configuration``.
 
@@ -106,7 +110,8 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
     adjacent to free space, [0, 1]; ``time`` simulated seconds; ``energy`` mechanical work of the
     motion so far, J; ``scene``, ``scene_seed``.
     No clock is in it: timings are in ``env.unwrapped.timings``. Where the agent chooses the SLAM
-    configuration, ``slam_configuration`` is the current index.
+    configuration, ``slam_configuration`` is the current index. Where actions are continuous,
+    ``travelled``, the share of the way that was free, takes the place of ``action_mask``.
 
     ## Arguments
     The fields of :class:`ms_slam_env.env.EnvConfig`, by keyword; nested ones as dataclass or
@@ -167,6 +172,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         self._actions: ActionDecoder = MotionActions(num_motions)
         if agent_configures_slam:
             self._actions = MotionAndConfigurationActions(num_motions, adapted, config.adaptation)
+        if config.actions == "continuous":
+            make = load_reference("ms_slam_env.env.continuous:ContinuousActions")
+            self._actions = make(num_motions, agent_configures_slam)
         self._observation = make_observation(
             config.observation, self.intrinsics, num_motions, self._actions.num_configurations
         )
@@ -316,9 +324,12 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         return seconds is not None and self.episode.frames[-1].time_s >= seconds
 
     def _info(self) -> dict[str, Any]:
+        of_motions: dict[str, Any] = {"travelled": self.simulation.travelled}
+        if self.config.actions == "discrete":
+            of_motions = {"action_mask": self.action_masks()}
         info = {
             **self.episode.info(),
-            "action_mask": self.action_masks(),
+            **of_motions,
             "mapped_area": self.coverage.mapped_area,
             "mapped_share": self.coverage.mapped_share,
         }
@@ -376,6 +387,9 @@ class ActiveSlamEnv(gymnasium.Env[Any, Any]):
         """(n,) which actions are possible now, under the name that sb3-contrib expects.
 
         (n + K,) where the agent also chooses the SLAM configuration.
+
+        Raises:
+            InputError: actions are continuous, or there was no reset.
         """
         _ = self.episode  # none yet: say so
         return self._actions.masks(self.simulation.action_masks())

@@ -107,8 +107,11 @@ class EnvConfig(Checked):
             pose of a dropped frame is predicted; its surface is not mapped.
         slam_config: options of the backend, or a configuration file (YAML), which also sets
             ``slam``, and ``image_size`` where that is not given.
-        observation: ``rgbd``, ``pixels``, ``features``, ``lookahead``, ``map``, ``goals``,
-            ``held``, ``candidates``, ``module:Class`` or a class.
+        observation: ``rgbd``, ``images``, ``pixels``, ``features``, ``lookahead``, ``map``,
+            ``goals``, ``held``, ``candidates``, ``module:Class`` or a class.
+        actions: ``discrete`` motions, or ``continuous``: a ``Box`` of six numbers in [-1, 1], the
+            translation in units of ``step_m`` and the rotation vector in units of ``step_rad``. A
+            motion that is blocked then stops short, and there are no masks.
         step_m: translation of a motion, metres.
         step_rad: rotation of a motion, radians.
         frames_per_action: frames that a free camera takes per motion, at 30 Hz; an arm takes as
@@ -150,6 +153,7 @@ class EnvConfig(Checked):
     adaptation: AdaptationConfig = field(default_factory=NoAdaptationConfig)
     frame_management: FrameSelectionConfig = field(default_factory=EveryFrameConfig)
     observation: str | type[Observation] = "features"
+    actions: str = chosen("discrete", "discrete", "continuous")
     step_m: float = bounded(0.12, 0, 1)
     step_rad: float = bounded(math.radians(12), 0, math.pi / 2)
     frames_per_action: int = bounded(1, 1, 100)

@@ -61,7 +61,8 @@ class Episode:
         scene, scene_seed: where the episode takes place.
         noise_seed: seed of the sensor noise.
         energy_j: mechanical work of the motion so far.
-        action: index of the last motion; 0 before the first.
+        action: index of the last motion, 0 before the first; a continuous one as a twist (6,), in
+            units of a step.
         steps_lost: consecutive steps for which tracking has been lost.
         steps_away: consecutive steps in which the camera has not been tracked in the first submap
             or one joined to it.
@@ -81,7 +82,7 @@ class Episode:
     scene_seed: int
     noise_seed: int
     energy_j: float = 0.0
-    action: int = 0
+    action: int | Float64 = 0
     steps_lost: int = 0
     steps_away: int = 0
     tracking_ok: bool = True

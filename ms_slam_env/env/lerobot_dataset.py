@@ -52,16 +52,19 @@ class Steps:
         """Columns by LeRobot's names: images (N, H, W, 3) uint8, all others (N, k)."""
         last = slice(None, -1)
         images = {f"observation.images.{k}": v[last] for k, v in self.observations.items()
-                  if v.ndim == 4}  # fmt: skip
+                  if v.shape[3:] == (3,)}  # fmt: skip
         seen = {f"observation.{k or 'state'}": v[last] for k, v in self.observations.items()
-                if v.ndim < 4}  # fmt: skip
+                if v.shape[3:] != (3,)}  # fmt: skip
         known = {f"info.{k}": v[last] for k, v in self.infos.items()}
         after = {
             "next.reward": np.asarray(self.rewards, np.float32),
             "next.done": np.asarray(self.terminated) | np.asarray(self.truncated),
             "next.truncated": np.asarray(self.truncated),
         }
-        rows = {**seen, "action": np.asarray(self.actions, np.int64), **after, **known}
+        actions = np.asarray(self.actions)
+        if actions.dtype.kind != "f":
+            actions = actions.astype(np.int64)
+        rows = {**seen, "action": actions, **after, **known}
         return images | {name: value.reshape(len(value), -1) for name, value in rows.items()}
 
 

@@ -49,6 +49,8 @@ DEPTH_SCALE_M = 4.0
 """Unit of depth in vectors."""
 DEPTH_CAP = _MAX_DEPTH_M / DEPTH_SCALE_M
 """Largest depth in vectors, in that unit."""
+DEPTH_LEVEL_M = 0.02
+"""Unit of depth in ``images``; 255 levels reach as far as a Kinect, 5 m."""
 GREY_BINS = 16
 """Bins of the grey histogram of ``features``."""
 ROWS, COLUMNS = 6, 8
@@ -64,13 +66,13 @@ _GOAL_LOW, _GOAL_HIGH = [-2.0] * 3 + [-1.0] * 3 + [0.0] * 2, [2.0] * 3 + [1.0] *
 
 
 class RGBDObservation(Observation):
-    """``color`` (H, W, 3) uint8, ``depth`` (H, W) float32 metres, ``state`` (28,) float32."""
+    """``color`` (H, W, 3) uint8, ``depth`` (H, W, 1) float32 metres, ``state`` (28,) float32."""
 
     def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
         self.space = spaces.Dict(
             {
                 "color": spaces.Box(0, 255, (*intrinsics.shape, 3), np.uint8),
-                "depth": spaces.Box(0, _MAX_DEPTH_M, intrinsics.shape, np.float32),
+                "depth": spaces.Box(0, _MAX_DEPTH_M, (*intrinsics.shape, 1), np.float32),
                 "state": spaces.Box(*STATE_BOUNDS),
             }
         )
@@ -79,9 +81,28 @@ class RGBDObservation(Observation):
         """Return copies of the live images and the state vector."""
         return {
             "color": knowledge.frame.color.copy(),
-            "depth": np.minimum(knowledge.frame.depth, _MAX_DEPTH_M),
+            "depth": np.minimum(knowledge.frame.depth, _MAX_DEPTH_M)[..., None],
             "state": state_vector(knowledge),
         }
+
+
+class ImagesObservation(Observation):
+    """``image`` (4, H, W) uint8: red, green, blue, depth; ``state`` (28,) float32.
+
+    What convolutional networks of other libraries take. A level of depth is `DEPTH_LEVEL_M`: 0
+    where there is no reading, 1 to 254 for 2 cm to 5.08 m, 255 for what is farther.
+    """
+
+    def __init__(self, intrinsics: Intrinsics, num_motions: int) -> None:
+        image = spaces.Box(0, 255, (4, *intrinsics.shape), np.uint8)
+        self.space = spaces.Dict({"image": image, "state": spaces.Box(*STATE_BOUNDS)})
+
+    def build(self, knowledge: RobotKnowledge) -> dict[str, Any]:
+        """Return the images, channels first, and the state vector."""
+        color, depth = knowledge.frame.color, knowledge.frame.depth
+        levels = np.where(depth > 0, np.clip(np.rint(depth / DEPTH_LEVEL_M), 1, 255), 0)
+        image = np.stack([*color.transpose(2, 0, 1), levels.astype(np.uint8)])
+        return {"image": image, "state": state_vector(knowledge)}
 
 
 class PixelsObservation(Observation):

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-from gymnasium.spaces import MultiDiscrete
+from gymnasium.spaces import Box, MultiDiscrete
 from numpy.typing import NDArray
 
 from ms_slam_env._runtime.extension import ExtensionPoint, check_options
@@ -223,9 +223,13 @@ def make_planner(text: str, env: Any, seed: int = 0, **more: Any) -> Planner:
     """
     cls, options = _parsed(text, more)
     recovery = options.pop(RECOVERY, cls.recovers)
-    if isinstance(getattr(env, "action_space", None), MultiDiscrete) and (
-        cls.motions_only or recovery
-    ):
+    space = getattr(env, "action_space", None)
+    if isinstance(space, Box) and (cls.motions_only or recovery):
+        raise InputError(
+            f"planner {text!r} chooses among discrete motions; this environment's actions are "
+            "continuous, which random or a planner of your own can choose"
+        )
+    if isinstance(space, MultiDiscrete) and (cls.motions_only or recovery):
         raise InputError(
             f"planner {text!r} chooses motions only; this environment also needs a "
             "SLAM configuration, which random, policy or a planner of your own can choose"

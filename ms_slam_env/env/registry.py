@@ -36,6 +36,7 @@ _OWN = "ms_slam_env.env.observations"
 
 OBSERVATIONS = {
     "rgbd": f"{_OWN}:RGBDObservation",
+    "images": f"{_OWN}:ImagesObservation",
     "pixels": f"{_OWN}:PixelsObservation",
     "features": f"{_OWN}:FeaturesObservation",
     "lookahead": f"{_OWN}:LookaheadObservation",

@@ -132,7 +132,7 @@ class EpisodeView:
         labels = None
         if predicted is not None:
             labels = [f"{describe(a)}: {i:.4f}, {d:.4f}" for a, (i, d) in enumerate(predicted)]
-        possible = self.env.action_masks()[: len(poses)]
+        possible = self.env.simulation.action_masks()
         shown = np.where(possible[:, None], [[240, 200, 40]], [[120, 120, 120]])
         candidates = rr.Points3D(
             poses[:, :3, 3], colors=shown, radii=0.008, labels=labels, show_labels=False

@@ -13,6 +13,7 @@ from ms_slam_env.camera import RGBDFrame
 from ms_slam_env.planning import OccupancyGrid
 from ms_slam_env.planning.candidates import PredictedViews
 from ms_slam_env.robot import NUM_ROTATIONS, NUM_TRANSLATIONS, ROTATIONS, TRANSLATIONS
+from ms_slam_env.robot.action_primitives import shares_of
 from ms_slam_env.slam.slam_backend import Views
 
 STATE_NAMES: tuple[str, ...] = (
@@ -29,7 +30,7 @@ Position relative to the start in units of 5 m (in the start camera's frame: x r
 forward); the first two columns of the rotation, R_ij the component along i of the camera's axis j;
 the divergences of the last step in units of M_I and M_D; whether SLAM tracked its last frame, the
 share of pixels that it explained, and consecutive steps lost as a share of the patience; the last
-motion, one-hot.
+motion, one-hot; of a continuous one, its share of each translation and rotation.
 """
 
 NUM_STATE = len(STATE_NAMES)
@@ -56,7 +57,8 @@ class RobotKnowledge:
         lost_share: consecutive steps lost, or away from the first submap, as a share of the
             patience.
         motion: index of the last motion among the 49, or among the 7 rotations where the
-            translation is fixed, even if it was blocked; 0 before the first.
+            translation is fixed, even if it was blocked; 0 before the first. A continuous one as a
+            twist (6,), in units of a step.
         motion_mask: (n,) which motions are possible now.
         configuration: index of the current SLAM configuration; 0 where there is only one.
         lookahead: predicts the divergences (n, 2) of the candidates, in units of (M_I, M_D).
@@ -76,7 +78,7 @@ class RobotKnowledge:
     tracking_ok: bool
     inlier_fraction: float
     lost_share: float
-    motion: int
+    motion: int | Float64
     motion_mask: NDArray[np.bool_]
     configuration: int
     lookahead: Callable[[], Float64]
@@ -93,7 +95,10 @@ def state_vector(knowledge: RobotKnowledge) -> Float32:
     """The values of ``STATE_NAMES``, (28,) float32 of order one, clipped to their bounds."""
     told = [knowledge.tracking_ok, knowledge.inlier_fraction, knowledge.lost_share]
     own = knowledge.T_start_camera, knowledge.divergence, np.array(told, dtype=np.float64)
-    return state_vectors(*own, knowledge.motion)
+    state = state_vectors(*own, 0 if isinstance(knowledge.motion, np.ndarray) else knowledge.motion)
+    if isinstance(knowledge.motion, np.ndarray):
+        state[-NUM_TRANSLATIONS - NUM_ROTATIONS :] = shares_of(knowledge.motion)
+    return state
 
 
 def state_vectors(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -64,6 +64,7 @@ class Simulation:
         T_world_kinematic: (4, 4) origin of the carrier's kinematics.
         episode: the episode so far; None before the first and if none could begin.
         carves: whether episodes keep an occupancy grid.
+        travelled: share of the last continuous motion that was free.
     """
 
     world: World
@@ -85,6 +86,7 @@ class Simulation:
         self.place: tuple[SceneName, int] | None = None
         self.episode: Episode | None = None
         self.carves = config.mask == MAP
+        self.travelled = 1.0
         nothing = np.zeros(0, dtype=bool)
         self._known_mask: tuple[NDArray[np.bool_], Episode | None, int] = nothing, None, 0
         self.fresh_slam = slam.state_like()
@@ -136,7 +138,7 @@ class Simulation:
 
     def start_at(self, start: Float64, rng: np.random.Generator) -> str:
         """Start at a pose (4, 4) with one frame; return why that failed, or an empty string."""
-        self.episode = None
+        self.episode, self.travelled = None, 1.0
         robot, scene = self.world.embodiment, self.world.scene
         try:
             robot.reset(start, rng)
@@ -166,12 +168,18 @@ class Simulation:
 
     def move(self, episode: Episode) -> tuple[bool, float]:
         """Make the episode's motion; return whether it was made, and the newly mapped area, m2."""
-        by_map = self.config.mask == MAP
-        may = not by_map or bool(self.action_masks()[episode.action])
-        offset = self.world.embodiment.candidate_motions()[episode.action][:3, 3] if by_map else 0
+        by_map, action, robot = self.config.mask == MAP, episode.action, self.world.embodiment
+        if isinstance(action, np.ndarray):
+            twist = action * np.repeat((self.config.step_m, self.config.step_rad), 3)
+            may, offset, move = True, twist[:3], partial(robot.move_by, twist)
+        else:
+            may = not by_map or bool(self.action_masks()[action])
+            offset = robot.candidate_motions()[action][:3, 3] if by_map else np.zeros(3)
+            move = partial(robot.move, action if may else 0)
         with self.timings.stage("move"):
-            motion = self.world.embodiment.move(episode.action if may else 0)
-        if by_map and may and not motion.made and np.any(offset):
+            motion = move()
+        self.travelled = motion.travelled
+        if by_map and may and not motion.made and offset.any():
             assert episode.occupancy is not None
             here = episode.T_world_camera_estimate
             episode.occupancy.touch(here[:3, 3] + here[:3, :3] @ offset)

@@ -22,6 +22,7 @@ from ms_slam_env.slam.shared.state_check import (
     MOST,
     SEED,
     ArrayOf,
+    Depending,
     OrNone,
     Real,
     WholeNumber,
@@ -45,12 +46,15 @@ _MAY_DIFFER = ("observation", "mask")
 """Settings that are compared where the two disagree on keeping an occupancy grid."""
 
 _STEPS = WholeNumber(most="steps")
+_TWIST = ArrayOf(np.float64, (6,), least=-1, most=1)
 _OF_EPISODE = {
     "scene": "",
     "scene_seed": SEED,
     "noise_seed": SEED,
     "energy_j": Real(0, MOST),
-    "action": WholeNumber(index_of="motions"),
+    "action": Depending(
+        lambda action: _TWIST if isinstance(action, np.ndarray) else WholeNumber(index_of="motions")
+    ),
     "steps_lost": _STEPS,
     "steps_away": _STEPS,
     "tracking_ok": True,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -135,12 +136,20 @@ class Matched:
     covered_share: float = 1.0
 
 
+def _is_named_truth(path: Path) -> bool:
+    named = r"truth|(^|[^a-z])(gt|ref|reference)([^a-z]|$)"
+    return re.search(named, Path(path).stem, re.IGNORECASE) is not None
+
+
 def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matched:
     """Read two TUM files, match their poses in time, and align them.
 
     Raises:
         InputError: a file that cannot be read, fewer than two poses in common, no alignment.
     """
+    if _is_named_truth(estimate) and not _is_named_truth(truth):
+        text = f"{estimate} is named like a truth, {truth} is not: the estimate comes first"
+        warnings.warn(text, InputWarning, 2)
     times, poses = read_trajectory(estimate)
     tracked = (
         tracked_beside(estimate, times)

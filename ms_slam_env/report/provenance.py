@@ -37,10 +37,17 @@ def provenance() -> dict[str, Any]:
         "time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "commit": git_commit(),
         "python": platform.python_version(),
-        "versions": {name: metadata.version(name) for name in _PACKAGES},
+        "versions": {name: version for name in _PACKAGES if (version := _version(name))},
         "platform": platform.platform(),
         "cpu": _cpu(),
     }
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:  # embreex exists for most processors only
+        return ""
 
 
 def git_commit(package: Path = _PACKAGE) -> str | None:

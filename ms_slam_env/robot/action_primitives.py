@@ -60,7 +60,22 @@ def decompose(step_m: float, step_rad: float) -> Float64:
     )
 
 
-def describe(action: int) -> str:
-    """Words for one of the 49 motions, such as ``"forward, yaw clockwise"``."""
+def shares_of(twist: Float64) -> Float64:
+    """The share (14,) of each translation and rotation in a twist (6,) within [-1, 1].
+
+    Of one of the 49 motions, the motion one-hot. The share of "none" is what the largest leaves.
+    """
+    moved = np.maximum(TRANSLATION_DIRECTIONS @ twist[:3], 0)
+    turned = np.maximum(ROTATION_AXES @ twist[3:], 0)
+    moved[0], turned[0] = 1 - moved.max(), 1 - turned.max()
+    return np.concatenate([moved, turned])
+
+
+def describe(action: int | Float64) -> str:
+    """Words for one of the 49 motions, such as ``"forward, yaw clockwise"``, or for a twist."""
+    if isinstance(action, np.ndarray):
+        named = zip((*TRANSLATIONS, *ROTATIONS), shares_of(action), strict=True)
+        words = [f"{share:.2f} {name}" for name, share in named if share and name != "none"]
+        return ", ".join(words) or "none"
     translation, rotation = divmod(int(action), NUM_ROTATIONS)
     return f"{TRANSLATIONS[translation]}, {ROTATIONS[rotation]}"

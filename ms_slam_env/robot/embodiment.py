@@ -26,6 +26,7 @@ class MotionResult:
         T_world_camera_kinematic: (k, 4, 4) the same poses as the carrier's kinematics report them.
         times_s: (k,) seconds since the motion began.
         energy_j: mechanical work spent, joules; 0 for a carrier without mass.
+        travelled: share of the way that was free, of a motion by `Embodiment.move_by`.
     """
 
     made: bool
@@ -33,9 +34,12 @@ class MotionResult:
     T_world_camera_kinematic: Float64
     times_s: Float64
     energy_j: float = 0.0
+    travelled: float = 1.0
 
     @staticmethod
-    def along(made: bool, start: Float64, motion: Float64, frames: int = 1) -> MotionResult:
+    def along(
+        made: bool, start: Float64, motion: Float64, frames: int = 1, travelled: float = 1.0
+    ) -> MotionResult:
         """Result with ``frames`` frames, one per frame period, at exactly known poses.
 
         The poses move on a straight line and turn evenly, from ``start`` (4, 4) by ``motion``
@@ -46,7 +50,17 @@ class MotionResult:
         parts = [make_pose(so3_exp(share * turn), share * motion[:3, 3]) for share in shares]
         poses: Float64 = np.stack([start @ part for part in [*parts, motion]])
         times_s = FRAME_PERIOD_S * np.arange(1, frames + 1, dtype=np.float64)
-        return MotionResult(made, poses, poses.copy(), times_s)
+        return MotionResult(made, poses, poses.copy(), times_s, travelled=travelled)
+
+
+def parts_of(twist: Float64, count: int) -> tuple[Float64, Float64]:
+    """The shares (count,) 1/count, 2/count, ... 1, and those shares (count, 4, 4) of a motion.
+
+    ``twist`` (6,) is a straight translation, metres, and a rotation vector, radians.
+    """
+    shares = np.arange(1, count + 1) / count
+    motions = [make_pose(so3_exp(share * twist[3:]), share * twist[:3]) for share in shares]
+    return shares, np.stack(motions)
 
 
 class HasClearance(Protocol):
@@ -105,6 +119,13 @@ class Embodiment(ABC):
     @abstractmethod
     def move(self, action: int) -> MotionResult:
         """Make motion ``action`` unless it is blocked."""
+
+    def move_by(self, twist: Float64) -> MotionResult:
+        """Move along a straight translation, metres, while turning, radians: a twist (6,).
+
+        Where the way is blocked the motion ends before, and so does the turn.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no motions but its own")
 
     @abstractmethod
     def get_state(self) -> dict[str, Any]:

@@ -17,11 +17,12 @@ from ms_slam_env.robot.action_primitives import (
     TRANSLATION_DIRECTIONS,
     decompose,
 )
-from ms_slam_env.robot.embodiment import Embodiment, HasClearance, MotionResult
+from ms_slam_env.robot.embodiment import Embodiment, HasClearance, MotionResult, parts_of
 from ms_slam_env.scenes.scene import Scene, outside, words
 
 CAMERA_RADIUS_M = 0.1  # half the width of an ASUS Xtion (18 cm), rounded up
 _LOOKED_AT_M = 0.05  # between points checked along a path in a known world
+_STOPS = 32  # places at which a blocked motion may end
 
 
 def check_room(scene: Scene, T_world_camera: Float64) -> Float64:
@@ -101,6 +102,21 @@ class FreeCamera(Embodiment):
         if made:
             self.T_world_camera = result.T_world_camera[-1].copy()
             self._masks = None
+        return result
+
+    def move_by(self, twist: Float64) -> MotionResult:
+        """Move by a twist (6,), or by the part of it, in 32nds, for which the ball is free."""
+        shares, motions = parts_of(twist, _STOPS)
+        R, position = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        ends = position + motions[:, :3, 3] @ R.T
+        if twist[:3].any() and not self.scene.segment_is_free(position, ends[-1], CAMERA_RADIUS_M):
+            free = self.scene.segments_are_free(position, ends[:-1], CAMERA_RADIUS_M)
+            motions = np.stack([np.eye(4), *motions[:-1][free]])
+            shares = np.append(0.0, shares[:-1][free])
+        share, start = float(shares[-1]), self.T_world_camera
+        result = MotionResult.along(share == 1, start, motions[-1], self._frames, share)
+        self.T_world_camera = result.T_world_camera[-1].copy()
+        self._masks = None
         return result
 
     def get_state(self) -> dict[str, Any]:

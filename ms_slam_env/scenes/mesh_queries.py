@@ -5,25 +5,30 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from embreex import rtcore_scene
-from embreex.mesh_construction import TriangleMesh
 from numpy.typing import NDArray
 
 from ms_slam_env._runtime.arrays import Float64
+from ms_slam_env._runtime.extension import load_reference
 from ms_slam_env.scenes.scene import TexturedMesh
+
+_WITHOUT_EMBREE = "ms_slam_env.scenes.warp_queries:WarpScene"
 
 
 class RayCaster:
-    """An Embree scene of one mesh; not picklable, cheap to rebuild."""
+    """An Embree scene of one mesh, or Warp's where embreex is missing; cheap to rebuild."""
 
     def __init__(self, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> None:
         """Build the hierarchy of ``vertices`` (V, 3) and ``faces`` (F, 3)."""
-        self._scene = rtcore_scene.EmbreeScene()
-        self._mesh = TriangleMesh(
-            self._scene,
-            np.ascontiguousarray(vertices, dtype=np.float32),
-            np.ascontiguousarray(faces, dtype=np.int32),
-        )
+        corners = np.ascontiguousarray(vertices, dtype=np.float32)
+        indices = np.ascontiguousarray(faces, dtype=np.int32)
+        try:
+            from embreex import rtcore_scene
+            from embreex.mesh_construction import TriangleMesh
+        except ImportError:
+            self._scene = load_reference(_WITHOUT_EMBREE)(corners, indices)
+        else:
+            self._scene = rtcore_scene.EmbreeScene()
+            self._mesh = TriangleMesh(self._scene, corners, indices)
 
     def first_hit(
         self, origins: Float64, directions: Float64

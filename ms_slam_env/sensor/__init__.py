@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from ms_slam_env.sensor.bodies import Body
     from ms_slam_env.sensor.casters import (
         EmbreeRayCaster,
-        EmbreeSingleRayCaster,
         RayCaster,
         WarpRayCaster,
     )
@@ -25,7 +24,6 @@ __all__ = [
     "Body",
     "ChangingLight",
     "EmbreeRayCaster",
-    "EmbreeSingleRayCaster",
     "NoNoise",
     "NoiseConfig",
     "RGBDSensor",

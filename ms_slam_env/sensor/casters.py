@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
-import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
-
+from ms_slam_env._runtime.extension import load_reference
 from ms_slam_env._runtime.warp import RecordedLaunch, wp
 from ms_slam_env.scenes.scene import TexturedMesh
 from ms_slam_env.sensor.embree import (
@@ -19,7 +15,7 @@ from ms_slam_env.sensor.embree import (
     cast_tiles,
     embree_library,
 )
-from ms_slam_env.sensor.rays import Hits, Pinhole, cast_rays, generate_rays
+from ms_slam_env.sensor.rays import Hits, Pinhole, cast_rays
 
 
 class RayCaster(ABC):
@@ -67,35 +63,6 @@ class EmbreeRayCaster(RayCaster):
         return RecordedLaunch(cast_tiles, tiles, inputs, "cpu").launch
 
 
-class EmbreeSingleRayCaster(RayCaster):
-    """Intel Embree on the CPU, one ray at a time, through embreex's interface."""
-
-    def __init__(self, mesh: TexturedMesh) -> None:
-        """Build Embree's acceleration structure."""
-        self._scene = EmbreeScene()
-        corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float32)
-        self._geometry = TriangleMesh(self._scene, corners)
-
-    def bind(
-        self, poses: wp.array, camera: Pinhole, hits: Hits, shape: tuple[int, int, int]
-    ) -> Callable[[], None]:
-        """See the base class; the arrays live on the CPU."""
-        origins = wp.zeros(math.prod(shape), dtype=wp.vec3, device="cpu")
-        directions = wp.zeros(math.prod(shape), dtype=wp.vec3, device="cpu")
-        inputs = [poses, camera, origins, directions]
-        generate = RecordedLaunch(generate_rays, shape, inputs, "cpu")
-
-        def cast() -> None:
-            generate.launch()
-            result = self._scene.run(origins.numpy(), directions.numpy(), output=True)
-            np.copyto(hits.t.numpy(), result["tfar"])
-            np.copyto(hits.u.numpy(), result["u"])
-            np.copyto(hits.v.numpy(), result["v"])
-            np.copyto(hits.face.numpy(), result["primID"])
-
-        return cast
-
-
 class WarpRayCaster(RayCaster):
     """Warp's bounding volume hierarchy, on the CPU or on CUDA.
 
@@ -119,8 +86,17 @@ class WarpRayCaster(RayCaster):
         return RecordedLaunch(cast_rays, shape, inputs, self._device).launch
 
 
+_SINGLE = "ms_slam_env.sensor.embree_single:EmbreeSingleRayCaster"
+
+
 def make_caster(mesh: TexturedMesh, device: str) -> RayCaster:
-    """Return the fastest caster of a device: Embree on the CPU, Warp elsewhere."""
+    """Return the fastest caster of a device: Embree on a CPU that it exists for, otherwise Warp."""
     if device != "cpu":
         return WarpRayCaster(mesh, device)
-    return EmbreeSingleRayCaster(mesh) if embree_library() is None else EmbreeRayCaster(mesh)
+    if embree_library() is not None:
+        return EmbreeRayCaster(mesh)
+    try:
+        single: RayCaster = load_reference(_SINGLE)(mesh)
+    except ImportError:  # no embreex
+        return WarpRayCaster(mesh, device)
+    return single

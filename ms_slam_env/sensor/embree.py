@@ -15,7 +15,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from embreex import rtcore_scene
 from numpy.typing import NDArray
 
 from ms_slam_env._runtime.warp import kernel_wp as wp
@@ -54,11 +53,15 @@ _FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
 
 @lru_cache(maxsize=1)
 def embree_library() -> ctypes.CDLL | None:
-    """Load Embree 4 with its function types declared; None if it cannot be found.
+    """Load Embree 4 with its function types declared; None if there is none, as on Linux on ARM.
 
     It opens the extension module instead of the library. On Linux and macOS the loader also
     searches a library's dependencies, and so finds Embree wherever the wheel installed it.
     """
+    try:
+        from embreex import rtcore_scene
+    except ImportError:
+        return None
     library = ctypes.CDLL(rtcore_scene.__file__)
     try:
         getattr(library, PACKET_FUNCTION)

@@ -77,6 +77,10 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
         ("evaluate missing.txt missing.txt", "cannot read trajectory missing.txt"),
         ("train nonsense", "unknown trainer 'nonsense'; valid choices: imitation, ppo"),
         *((f"train {name} {words}", said) for name in TRAINERS for words, said in PROBLEMS),
+        (
+            "train ppo --env-id MSActiveSLAM-FreeCamera-Continuous-v0",
+            "the actions of 'MSActiveSLAM-FreeCamera-Continuous-v0' are continuous, which no tr",
+        ),
         ("train qrdqn --observation rgbd", "observation 'rgbd' has several parts"),
         ("train sb3 --num-envs -1", "Args.num_envs = -1"),
         ("train sb3 --n-steps -1", "Args.n_steps = -1"),

@@ -593,3 +593,16 @@ def test_bad_maps_are_one_line_and_code_2(
     assert "holds no points" in refused([*maps[:2], "--true-map", str(empty)])
     assert "not finite" in refused(["--map", str(endless), *maps[2:]])
     assert "20 neighbours need as many points" in refused(["--map", str(few), *maps[2:]])
+
+
+@pytest.mark.parametrize("name", ["groundtruth.txt", "fr1_gt.txt", "Reference.tum"])
+def test_files_in_the_wrong_order_get_a_warning(tmp_path: Path, capsys: Any, name: str) -> None:
+    estimate, truth = map(Path, write_pair(tmp_path))
+    truth = truth.rename(tmp_path / name)
+    assert main(["evaluate", str(truth), str(estimate)]) == 0
+    assert f"{name} is named like a truth, {estimate} is not" in capsys.readouterr().err
+    assert main(["evaluate", str(estimate), str(truth)]) == 0
+    assert "named like" not in capsys.readouterr().err
+    other = Path(shutil.copy(truth, tmp_path / "reference.txt"))  # two truths are compared silently
+    assert main(["evaluate", str(other), str(truth)]) == 0
+    assert "named like" not in capsys.readouterr().err

@@ -17,11 +17,12 @@ minari = pytest.importorskip("minari")
 pq = pytest.importorskip("pyarrow.parquet")
 pd = pytest.importorskip("pandas")
 
-WORDS = ["record", "--scenes", "table", "--scene-seeds", "1", "--options", "image_size=80x60"]
+WORDS = ["record", "--scenes", "table", "--scene-seeds", "1"]
+SMALL = "image_size=80x60"
 
 
-def record(out, *more):
-    return main([*WORDS, "--out", str(out), *map(str, more)])
+def record(out, *more, options=()):
+    return main([*WORDS, "--options", SMALL, *options, "--out", str(out), *map(str, more)])
 
 
 def load(out, name, monkeypatch):
@@ -83,6 +84,29 @@ def test_observations_of_several_parts(tmp_path, monkeypatch):
         np.testing.assert_array_equal(found, expected)  # no lossy JPEG
 
 
+@pytest.mark.parametrize("form", ["minari", "lerobot"])
+def test_continuous_actions(tmp_path, monkeypatch, form):
+    words = ("--planner", "random", "--episodes", 1, "--steps", 3, "--format", form)
+    assert record(tmp_path, *words, options=["actions=continuous"]) == 0
+    if form == "minari":
+        (episode,) = load(tmp_path, "random-v0", monkeypatch)
+        actions, shares = episode.actions, episode.infos["travelled"][1:]
+    else:
+        _, _, (rows,) = rows_of(tmp_path / "random-v0")
+        actions = np.float32([row["action"] for row in rows])
+        shares = [row["info.travelled"] for row in rows[1:]]
+    env = gym.make(
+        "MSActiveSLAM-FreeCamera-Continuous-v0",
+        scene="table",
+        num_scene_seeds=1,
+        image_size="80x60",
+    )
+    env.reset(seed=0)
+    happened = [env.step(action)[-1]["travelled"] for action in actions]
+    assert happened[: len(shares)] == list(shares)
+    assert len(np.unique(actions)) == 18
+
+
 # -- In LeRobot's format, read back as its reader does: Parquet files, JSON, PNG ---------------
 
 
@@ -106,7 +130,7 @@ def rows_of(folder):
     return info, episodes, rows
 
 
-@pytest.mark.parametrize("observation", ["features", "rgbd"])
+@pytest.mark.parametrize("observation", ["features", "rgbd", "images"])
 def test_a_dataset_for_lerobot_is_what_happened(tmp_path, capsys, observation):
     words = ("--format", "lerobot", "--planner", "random", "--observation", observation)
     assert record(tmp_path, *words, "--episodes", 2, "--steps", 4, "--seed", 7) == 0
@@ -132,11 +156,14 @@ def test_a_dataset_for_lerobot_is_what_happened(tmp_path, capsys, observation):
             if observation == "features":
                 np.testing.assert_array_equal(np.float32(row["observation.state"]), seen)
                 continue
+            np.testing.assert_array_equal(np.float32(row["observation.state"]), seen["state"])
+            if observation == "images":  # of four channels, which LeRobot has no image for
+                np.testing.assert_array_equal(row["observation.image"], seen["image"].ravel())
+                continue
             image = Image.open(io.BytesIO(row["observation.images.color"]["bytes"]))
             np.testing.assert_array_equal(image, seen["color"])
             depth = np.reshape(np.float32(row["observation.depth"]), (60, 80))
-            np.testing.assert_array_equal(depth, seen["depth"])
-            np.testing.assert_array_equal(np.float32(row["observation.state"]), seen["state"])
+            np.testing.assert_array_equal(depth, seen["depth"][..., 0])
 
 
 def played(length):

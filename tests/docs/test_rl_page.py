@@ -21,12 +21,13 @@ def test_the_examples_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
     monkeypatch.chdir(tmp_path)
     assert {language for language, _ in BLOCKS} == {"python", "sh"}  # no other spelling of Python
     sources = [source for language, source in BLOCKS if language == "python"]
-    assert len(sources) == 12
+    assert len(sources) == 14
     names: dict[str, Any] = {}
     for source in sources:
         small = re.sub(r"^OPTIONS = .*$", SMALL, source, flags=re.MULTILINE)
         exec(compile(small, "docs/rl.md", "exec"), names)
     assert len(names["best"]) == 4
+    assert 0 <= names["free"].unwrapped.simulation.travelled <= 1
     assert [path.name for path in Path("films").iterdir()] == ["rl-video-episode-0.mp4"]
     names["model"].save(tmp_path / "model.zip")
     env = names["gym"].make(names["ID"], **names["OPTIONS"])

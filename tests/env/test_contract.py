@@ -449,7 +449,7 @@ def test_options_of_slam_stand_behind_its_name_and_in_slam_config():
         ({"slam": "orb"}, "valid choices: .*surfel"),
         ({"slam": "surfel,check"}, "backend 'surfel,check': 'check' is not option=value"),
         ({"slam": "surfel,slips=1"}, "unknown option of SurfelConfig 'slam_config.slips'"),
-        ({"observation": "pixel"}, "valid choices: rgbd, pixels, features"),
+        ({"observation": "pixel"}, "valid choices: rgbd, images, pixels, features"),
         (
             {"steps": 3},
             "'steps'; valid choices: embodiment, render_mode, task, max_episode_steps, scene",

@@ -13,12 +13,12 @@ from ms_slam_env.camera import Intrinsics, xtion
 from ms_slam_env.geometry import look_at, se3_exp
 from ms_slam_env.sensor import (
     EmbreeRayCaster,
-    EmbreeSingleRayCaster,
     RGBDSensor,
     WarpRayCaster,
     casters,
     embree,
 )
+from ms_slam_env.sensor.embree_single import EmbreeSingleRayCaster
 from ms_slam_env.sensor.rays import make_hits, make_pinhole
 
 SMALL = xtion("80x60")

@@ -10,7 +10,8 @@ from ms_slam_env.camera import Distortion, xtion
 from ms_slam_env.camera.undistortion import undistort_depth
 from ms_slam_env.geometry import look_at, transform_points
 from ms_slam_env.sensor import RGBDSensor
-from ms_slam_env.sensor.casters import EmbreeSingleRayCaster, WarpRayCaster
+from ms_slam_env.sensor.casters import WarpRayCaster
+from ms_slam_env.sensor.embree_single import EmbreeSingleRayCaster
 from ms_slam_env.sequences import LensDistortion, MotionBlur, RollingShutter, render_sequence
 
 PLAIN = xtion("80x60")

@@ -53,6 +53,7 @@ def supported_slam(config: EnvConfig) -> SurfelConfig:
     surfel: SurfelConfig = check_parameters("surfel", config.slam_config)
     has: list[tuple[str, Any, Any]] = [
         ("observation", config.observation, "features"),
+        ("actions", config.actions, "discrete"),
         ("pose", config.pose, "slam"),
         ("mask", config.mask, "true"),
         ("frames_per_action", config.frames_per_action, 1),

@@ -17,7 +17,7 @@ from ms_slam_env.robot.arm.clearance import ClearanceField, LinkClearance
 from ms_slam_env.robot.arm.feasibility import LIMIT_MARGIN_RAD, Feasibility, FeasibilityResult
 from ms_slam_env.robot.arm.inverse_kinematics import solve_pose
 from ms_slam_env.robot.arm.model import load_arm
-from ms_slam_env.robot.embodiment import Embodiment, HasClearance, MotionResult
+from ms_slam_env.robot.embodiment import Embodiment, HasClearance, MotionResult, parts_of
 from ms_slam_env.scenes.scene import Scene
 
 
@@ -34,6 +34,9 @@ def frame_times(duration_s: float, config: ArmConfig) -> Float64:
     if k is None:
         k = max(1, int(np.ceil(duration_s * config.camera_hz - 1e-6)))
     return np.arange(1, k + 1) / config.camera_hz
+
+
+_STOPS = 16  # places at which a motion that is not possible as a whole may end
 
 
 class ArmEmbodiment(Embodiment):
@@ -136,6 +139,23 @@ class ArmEmbodiment(Embodiment):
                 .ok
             )
 
+    def free_part(self, twist: Float64) -> tuple[float, Float64, Float64, float]:
+        """The longest part, in 16ths, of a motion by a twist (6,) that is possible from here.
+
+        Returns:
+            its share, 0 if there is none; the motion ``T_camera_next`` (4, 4); joint angles (W, n)
+            along it; its duration in seconds.
+        """
+        shares, motions = parts_of(twist, _STOPS)
+        parts = self.probe().q.shape[1] - 1  # as many as for one of the 49 motions
+        with self.timings.stage("mask"):
+            q, T_base_camera = self.planning_state()
+            found = self.feasibility.probe(q, T_base_camera @ motions, parts)
+        if not found.ok.any():
+            return 0.0, np.eye(4), found.q[0, :1], 0.0
+        k = int(np.flatnonzero(found.ok)[-1])
+        return float(shares[k]), motions[k], found.q[k], float(found.duration_s[k])
+
     def get_state(self) -> dict[str, Any]:
         """The base pose and the joint angles; the rest follows from them."""
         return {"T_world_base": self.T_world_base.copy(), "q": self.q.copy()}
@@ -158,17 +178,28 @@ class KinematicArm(ArmEmbodiment):
         probe = self.probe()
         made = bool(probe.ok[action])
         duration = float(probe.duration_s[action]) if made else 0.0
+        poses, times = self._follow(self.motions[action], probe.q[action], duration)
+        return MotionResult(made, poses, poses.copy(), times)
+
+    def move_by(self, twist: Float64) -> MotionResult:
+        """Move by a twist (6,), or by the part of it that is possible; see ``free_part``."""
+        share, motion, waypoints, duration = self.free_part(twist)
+        poses, times = self._follow(motion, waypoints, duration)
+        return MotionResult(share == 1, poses, poses.copy(), times, travelled=share)
+
+    def _follow(
+        self, motion: Float64, waypoints: Float64, duration: float
+    ) -> tuple[Float64, Float64]:
+        """Camera poses (k, 4, 4) and times (k,) of the frames of a motion, which is made."""
         times = frame_times(duration, self.config)
         if duration > 0:
-            q = self._along(probe.q[action], np.minimum(times / duration, 1.0))
+            q = self._along(waypoints, np.minimum(times / duration, 1.0))
+            target = self.chain.camera_pose(self.q) @ motion
+            q[times >= duration] = solve_pose(self.chain, q[-1:], target).q[0]
         else:
             q = np.tile(self.q, (len(times), 1))
-        if made and duration > 0:
-            target = self.chain.camera_pose(self.q) @ self.motions[action]
-            q[times >= duration] = solve_pose(self.chain, q[-1:], target).q[0]
         self.set_joints(q[-1])
-        poses = self.T_world_base @ self.chain.camera_pose(q)
-        return MotionResult(made, poses, poses.copy(), times)
+        return self.T_world_base @ self.chain.camera_pose(q), times
 
     @staticmethod
     def _along(waypoints: Float64, share_of_time: Float64) -> Float64:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from ms_slam_env._runtime.timings import Timings
 from ms_slam_env.geometry import relative_angle, transform_points
 from ms_slam_env.robot.arm.arm import ArmEmbodiment, frame_times
 from ms_slam_env.robot.arm.arm_config import ArmConfig
+from ms_slam_env.robot.arm.cartesian_path import progress
 from ms_slam_env.robot.arm.controller import CONTROL_HZ, Controller, Plan, checked_ticks
 from ms_slam_env.robot.arm.dynamics import ArmDynamics, Imperfections, Motion
 from ms_slam_env.robot.arm.feasibility import MOST_STRETCH
@@ -88,11 +89,15 @@ class DynamicArm(ArmEmbodiment):
     def move(self, action: int) -> MotionResult:
         """Make motion ``action`` if the mask allows it, else hold still for a frame."""
         probe = self.probe()
-        if probe.ok[action]:
-            plan = self._plan(action)
-        else:
-            plan = Plan(self.q_command[None], 1 / CONTROL_HZ, False, 0.0, 0.0)
-        return self._execute(plan)[0]
+        part = self.motions[action], float(probe.duration_s[action])
+        return self._execute(self._plan(*part) if probe.ok[action] else self._rest())[0]
+
+    def move_by(self, twist: Float64) -> MotionResult:
+        """Move by a twist (6,), or by the part of it that is possible; see ``free_part``."""
+        share, motion, _, duration_s = self.free_part(twist)
+        result, *_ = self._execute(self._plan(motion, duration_s) if share else self._rest())
+        made = result.made and share == 1
+        return replace(result, made=made, travelled=share * result.travelled)
 
     def attempt(self, action: int) -> Attempt:
         """Try motion ``action`` regardless of the mask, then restore the state.
@@ -100,7 +105,8 @@ class DynamicArm(ArmEmbodiment):
         A masked motion gets the longest time that the mask would permit.
         """
         before, probe = self._moving_state(), self.probe()
-        plan = self._plan(action, 1.0 if probe.ok[action] else MOST_STRETCH)
+        stretch = 1.0 if probe.ok[action] else MOST_STRETCH
+        plan = self._plan(self.motions[action], stretch * float(probe.duration_s[action]))
         _, stopped, q_link = self._execute(plan)
         wanted = self.T_world_base @ self.chain.camera_pose(plan.q[-1])
         error_m = float(np.linalg.norm(self.T_world_camera[:3, 3] - wanted[:3, 3]))
@@ -125,12 +131,13 @@ class DynamicArm(ArmEmbodiment):
             self.stand_at(state["T_world_base"])
         self._restore(state)
 
-    def _plan(self, action: int, stretch: float = 1.0) -> Plan:
-        probe = self.probe()
+    def _plan(self, motion: Float64, least_s: float) -> Plan:
         q, T_base_camera = self.planning_state()
-        least_s = stretch * float(probe.duration_s[action])
         with self.timings.stage("ik"):
-            return self.controller.plan(q, T_base_camera @ self.motions[action], least_s)
+            return self.controller.plan(q, T_base_camera @ motion, least_s)
+
+    def _rest(self) -> Plan:
+        return Plan(self.q_command[None], 1 / CONTROL_HZ, False, 0.0, 0.0)
 
     def _execute(self, plan: Plan) -> tuple[MotionResult, bool, Float64]:
         """Follow a plan; return the result, whether the arm made a protective stop, and the joint
@@ -153,7 +160,8 @@ class DynamicArm(ArmEmbodiment):
         stopped = tick is not None
         made = plan.followed and not stopped
         seconds = steps * self.dynamics.timestep_s
-        result = MotionResult(made, poses, kinematic, seconds, motion.energy_j)
+        travelled = 1.0 if tick is None else float(progress(np.array(tick / (len(plan.q) - 1))))
+        result = MotionResult(made, poses, kinematic, seconds, motion.energy_j, travelled)
         return result, stopped, q_link
 
     def _run(self, q_command: Float64, tick_s: float, steps: int) -> tuple[Motion, Float64]:

@@ -94,7 +94,9 @@ class Feasibility:
         self._grid = _grid(clearance_field, device)
         self._buffers: dict[tuple[int, int], _Buffers] = {}
 
-    def probe(self, q: Float64, T_base_targets: Float64) -> FeasibilityResult:
+    def probe(
+        self, q: Float64, T_base_targets: Float64, least_parts: int = FEWEST_PARTS
+    ) -> FeasibilityResult:
         """Try the Cartesian paths from joint angles (n,) to camera poses (k, 4, 4)."""
         T_start = self._chain.camera_pose(q)
         targets = np.asarray(T_base_targets, dtype=np.float64)
@@ -105,7 +107,7 @@ class Feasibility:
             np.linalg.norm(turn, axis=1) / self._config.speed_rad_s,
         )
         still = duration < _STILL_S
-        size = len(targets), 1 + _parts(step, turn)
+        size = len(targets), 1 + max(least_parts, _parts(step, turn))
         if size not in self._buffers:
             self._buffers[size] = _Buffers(*size, self._chain, self._device)
         buffers = self._buffers[size]
