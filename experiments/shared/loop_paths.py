@@ -18,6 +18,8 @@ ORBITS_M = (0.9, 0.7, 0.5)
 """Radii of a path around an object; the first that fits is used."""
 _OBJECT_M = 0.4  # radius around the path's axis in which the object lies
 _ORBIT_CLEARANCE_M = 0.15
+_LAPS_M = 0.06  # two laps are about 10 cm apart
+_SWAY = ((0.382, 0.0), (0.618, 0.25))  # periods a lap, which no number of laps makes whole; phase
 _ORBIT_GRID_M = 0.25
 PATHS = ("around", "corridor", "handheld")
 HANDHELD_FRAMES = 600
@@ -93,7 +95,8 @@ def around_object(
 
     As in USME's relocalisation test, section 1.3 (2): "steadily around a textured object, a few
     times". Of the free circles, it uses the one around the most surface below the camera, and looks
-    at that surface.
+    at that surface. It sways by `_LAPS_M` across and up, so that no lap repeats another: a hand
+    would not either, and images that are alike to the last bit are found again too easily.
 
     Args:
         scene: scene of the path.
@@ -126,10 +129,13 @@ def around_object(
     near = below[np.hypot(*(below[:, :2] - centre[:2]).T) < _OBJECT_M]
     target = np.array([*centre[:2], near[:, 2].mean()])
     begin = np.random.default_rng([seed, 8]).uniform(0, 2 * np.pi)
-    angle = begin + 2 * np.pi * np.linspace(0, 1, 1000)
-    eyes = centre + radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    lap = _at_speed(eyes, target - eyes, step_m, step_deg)
-    return np.concatenate([lap] * laps), len(lap)
+    turns = np.linspace(0, laps, 1000 * laps)
+    angle = begin + 2 * np.pi * turns
+    across, up = (_LAPS_M * np.sin(2 * np.pi * (rate * turns + phase)) for rate, phase in _SWAY)
+    far = radius + across
+    eyes = centre + np.stack([far * np.cos(angle), far * np.sin(angle), up], axis=1)
+    poses = _at_speed(eyes, target - eyes, step_m, step_deg)
+    return poses, len(poses) // laps
 
 
 def _at_speed(eyes: Float64, gaze: Float64, step_m: float, step_deg: float) -> Float64:

@@ -377,7 +377,7 @@ def _errors(rows: Sequence[Row]) -> Chart:
 
 
 def _paths(rows: Sequence[Row]) -> Chart:
-    """Plot every sequence from above, as in USME's figure 8."""
+    """Plot every sequence from above, as in USME's Fig. 8."""
     panels = []
     for sequence in dict.fromkeys(row["spec"]["sequence"] for row in finished(rows)):
         own = [row for row in finished(rows) if row["spec"]["sequence"] == sequence]

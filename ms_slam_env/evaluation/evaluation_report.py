@@ -184,8 +184,9 @@ def trajectory_tables(found: Found, options: TrajectoryOptions) -> list[Table]:
         keys: list[Column | str] = ["length_m", "sub_trajectories", *drifts]
         tables.append(make_table(keys, found["drift_by_length"], title))
     printed = (absolute_key(options, "m"), "ate_printed_m", "rpe_m", *_PRINTED[1:])
-    note = "As Zhang and Scaramuzza define them, beside ours; they depend on the origin."
-    tables.append(_one_line(printed, found, "USME equations 2 and 5", note))
+    note = "Beside ours; they depend on the origin. USME's equations 2 and 5 appear to be these."
+    title = "Errors as Zhang and Scaramuzza define them"
+    tables.append(_one_line(printed, found, title, note))
     shown = [key for key in _ROBUSTNESS if found.get(key) is not None]
     note = f"{_gaps(found)}."
     if found.get("robustness_reason"):

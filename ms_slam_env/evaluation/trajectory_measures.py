@@ -174,7 +174,7 @@ def _relative_or_none(matched: Matched, part: slice, options: TrajectoryOptions)
 
 
 def _as_printed(matched: Matched, options: TrajectoryOptions) -> dict[str, Any]:
-    """USME's equation (2), and root mean square and median of (5): see `printed_errors`."""
+    """ATE and RPE (RMS, median) as Zhang and Scaramuzza define them: see `printed_errors`."""
     P, Q = matched.estimate, matched.truth
     relative = printed_relative_errors(P, Q, times=matched.times, **options.relative)
     return {

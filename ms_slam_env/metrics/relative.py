@@ -258,10 +258,11 @@ def drifts(
 def printed_errors(
     estimate: ArrayLike, truth: ArrayLike, align: str = "se3", kind: str = "translation"
 ) -> Float64:
-    """Errors (N,), m or rad, of USME equation (1); takes the arguments of `absolute_errors`.
+    """Errors (N,), m or rad, as Zhang and Scaramuzza define them; arguments of `absolute_errors`.
 
-    The typeset formulas are missing from our text of USME. Its words (the rotation dR_i between
-    estimated and true state, N states, pairs d_k = {x_s, x_e} with e > s) match Zhang and
+    They stand for USME's equations (1) to (5). The typeset formulas are missing from our text of
+    USME. Its words (the rotation dR_i between estimated and true state, N states, pairs
+    d_k = {x_s, x_e} with e > s) match Zhang and
     Scaramuzza, "A tutorial on quantitative trajectory evaluation for visual(-inertial) odometry",
     IROS 2018, so their formulas are used:
 
@@ -281,14 +282,14 @@ def printed_errors(
 
 @with_arguments_of(printed_errors)
 def printed_ate(errors: Float64) -> ErrorStatistics:
-    """Statistics of `printed_errors`; ``rmse`` is USME equation (2)."""
+    """Statistics of `printed_errors`; ``rmse`` stands for USME equation (2)."""
     return statistics_of(errors)
 
 
 def printed_relative_errors(
     estimate: ArrayLike, truth: ArrayLike, kind: str = "translation", **which: Any
 ) -> Float64:
-    """Errors (K,), m or rad, of USME equation (5); ``which`` are options of `pose_pairs`."""
+    """Relative errors (K,), m or rad, as `printed_errors`; ``which``: options of `pose_pairs`."""
     check_kind(kind)
     poses, true = check_pair(estimate, truth)
     first, second = pose_pairs(true, **which).T

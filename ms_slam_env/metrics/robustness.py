@@ -3,7 +3,8 @@ long SLAM is lost, when the scale of an estimate settles, and how accurate it is
 
 Source: Qu, Zhang, Yang, Dong, "USME: unified SLAM measurement and evaluation", Navigation
 Positioning and Timing 2021, equations (9) to (13); after Li et al., "Survey and evaluation of
-monocular visual-inertial SLAM algorithms for augmented reality", 2019.
+monocular visual-inertial SLAM algorithms for augmented reality", 2019. The typeset formulas are
+missing from our text of USME; these are what its words say, as in Li et al.
 """
 
 from __future__ import annotations

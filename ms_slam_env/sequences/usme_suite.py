@@ -51,7 +51,8 @@ class UsmeSequence:
         path: camera path.
         noise: noise model of the sensor.
         perturbations: ``NAME,option=value,...``.
-        loops: number of times the path returns to an earlier place; None if it only wanders.
+        loops: number of times the path returns to an earlier place; None if it only wanders. With
+            0, no frame shows again what was out of sight (`find_revisits`).
         about: description.
     """
 
@@ -99,16 +100,16 @@ SUITE: tuple[UsmeSequence, ...] = (
     UsmeSequence(
         "residential-no-loop",
         "residential_street",
-        RoutePath((*_AROUND, "C", "C-S"), **_OUTDOORS),
+        RoutePath((*_AROUND, "W-SW"), **_OUTDOORS),
         "range",
-        "long way along residential streets that never comes back",
+        "long way along residential streets that sees no place twice",
     ),
     UsmeSequence(
         "residential-one-loop",
         "residential_street",
         RoutePath((*_AROUND, "SW", "S"), **_OUTDOORS),
         "range",
-        "the same way, but closing one large loop at its end",
+        "the same way, but going on until it closes one large loop at its end",
         loops=1,
     ),
     UsmeSequence(
@@ -155,6 +156,7 @@ SUITE: tuple[UsmeSequence, ...] = (
             "moving-objects,kind=box,count=5,speed_m_s=0.8",
             "moving-objects,kind=person,count=3,speed_m_s=1.2",
         ),
+        loops=None,
     ),
     UsmeSequence(
         "room-fast",

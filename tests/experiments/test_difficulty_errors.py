@@ -8,6 +8,7 @@ from ms_slam_experiments.difficulty_errors import DifficultyErrors, correlations
 from ms_slam_experiments.light_tolerance import LightSpec, LightTolerance, relit
 from ms_slam_experiments.orbit import Orbit
 from ms_slam_experiments.shared.loop_paths import around_object
+from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
 
 from ms_slam_env import scenes
@@ -61,19 +62,32 @@ def test_light_is_linear_and_no_change_is_no_divergence() -> None:
 def test_an_orbit_goes_round_what_it_looks_at() -> None:
     scene = scenes.make("table", 1000)
     poses, lap = around_object(scene, 3, laps=2)
-    assert len(poses) == 2 * lap
-    np.testing.assert_array_equal(poses[:lap], poses[lap:])
+    assert len(poses) // 2 == lap
+    apart = cKDTree(poses[lap:, :3, 3]).query(poses[:lap, :3, 3])[0]
+    assert 0.05 < np.sqrt((apart**2).mean()) < 0.12
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert steps.max() <= 0.0401  # also from lap to lap
     places = poses[:lap, :3, 3]
     centre = (places.max(axis=0) + places.min(axis=0)) / 2
     radius = np.linalg.norm((places - centre)[:, :2], axis=1)
-    np.testing.assert_allclose(radius, radius[0], rtol=0.02)
-    assert scene.clearance(places).min() > 0.1
+    assert np.ptp(radius) < 0.2
+    assert scene.clearance(poses[:, :3, 3]).min() > 0.1
     gaze = poses[:lap, :3, 2]
     inward = (centre - places)[:, :2] / radius[:, None]
     assert ((gaze[:, :2] * inward).sum(axis=1) > 0.3).all()
     assert (gaze[:, 2] < 0).all()  # the table stands below the camera
-    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    assert steps.max() <= 0.0401
+
+
+@pytest.mark.parametrize("seed", [2000, 2001])
+@pytest.mark.parametrize("name", ["table", "living_room"])
+def test_no_two_laps_of_an_orbit_are_alike(name: str, seed: int) -> None:
+    scene = scenes.make(name, seed)
+    poses, lap = around_object(scene, seed, laps=3)
+    assert scene.clearance(poses[:, :3, 3]).min() > 0.05
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        own, other = (poses[k * lap : (k + 1) * lap, :3, 3] for k in (a, b))
+        apart = cKDTree(other).query(own)[0]
+        assert 0.04 < np.sqrt((apart**2).mean()) < 0.14
 
 
 def test_every_length_of_the_dark_is_run_with_every_backend() -> None:

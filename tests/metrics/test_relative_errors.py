@@ -1,4 +1,4 @@
-"""RPE over frames, metres and seconds against evo and a plain loop; drift; USME to the letter."""
+"""RPE over frames, metres and seconds against evo and a plain loop; drift; Zhang and Scaramuzza."""
 
 from __future__ import annotations
 
