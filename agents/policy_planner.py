@@ -119,6 +119,16 @@ class PpoAgent(ShippedAgent):
     default_path = SHIPPED / "ppo.safetensors"
 
 
+class Sb3Agent(ShippedAgent):
+    """The policy for ``reward="divergence-and-error"``, trained by Stable-Baselines3's DQN.
+
+    It sees ``features``, without the predictions of the greedy planner, and does not backtrack when
+    lost.
+    """
+
+    default_path = SHIPPED / "sb3.safetensors"
+
+
 class PaperAgent(ShippedAgent):
     """The policy for ``reward="paper"``: like Algorithm 1, it keeps divergences near their targets.
 

@@ -66,6 +66,8 @@ class RewardShares(SteppedExperiment):
     planners: tuple[str, ...] = ("stationary", "random", "greedy")
     """NAME or module:Class, options appended as in greedy,rho_I=0.3."""
     scenes: tuple[str, ...] = ("living_room", "corridor", "table", "wall")
+    task: str = "room"
+    """Task that supplies other options than the reward."""
     episodes: int = 5
     steps: int = 150
     seeds: str = "validation"

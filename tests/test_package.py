@@ -202,7 +202,9 @@ def test_after_a_base_install_the_shipped_agents_run() -> None:
     code = f"missing = {sorted(missing)}{PLAY_AGENTS}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.split() == ["agent-home", "agent-paper", "agent-ppo", "agent-room"]
+    assert done.stdout.split() == [
+        *("agent-home", "agent-paper", "agent-ppo", "agent-room", "agent-sb3")
+    ]
 
 
 @pytest.mark.parametrize(

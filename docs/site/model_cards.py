@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,11 +31,17 @@ _SCORES = (
     *("planner", "episodes", "f_score_5cm", "f_score_5cm_area", "ate_m", "lost"),
     *("not_recovered_share", "violations", "decision_ms"),
 )
+_JUDGED: Mapping[str, Callable[[str], bool]] = {
+    "planners": _SCORES.__contains__,
+    "reward_shares": lambda column: True,
+}
+"""Kinds of results that judge planners, and which columns of their tables a card shows."""
 _ACROSS = "over all scenes"
 _VERDICTS = (
     (PAIRS["f_score_5cm"], "f_score_5cm", "F-score"),
     (PAIRS["f_score_5cm_area"], "f_score_5cm_area", "area under F-score"),
     (PAIRS["return"], "return", "return"),
+    ("Share of starts, by return", "return", "return"),
 )
 """Title of a table of probabilities, metric that selects the best classical planner, its name."""
 _NO_RIVALS = (
@@ -130,7 +136,7 @@ def _config(one: FoundResult) -> Mapping[str, Any]:
 
 def _card(policy: Policy, found: Sequence[FoundResult], page: Path, docs: Path) -> str:
     trainings = [one for one in found if policy.is_trained_in(one)]
-    benchmarks = [one for one in found if one.results.kind == "planners" and _scores(one, policy)]
+    benchmarks = [one for one in found if one.results.kind in _JUDGED and _scores(one, policy)]
     parts = [f"## `{policy.planner}`\n", _facts(policy), _command(policy.known)]
     scores: dict[str, _Score] = {}  # by task, those with the most evidence
     for score in (score for one in benchmarks for score in _scores(one, policy)):
@@ -244,7 +250,8 @@ def _score_text(score: _Score, policy: Policy, page: Path, docs: Path) -> Iterat
     seeds = _config(score.one).get("seeds", "test")
     if seeds != "test":
         yield f"On {seeds} seeds:\n" if seeds in SEED_SPLITS else f"On the seeds {seeds}:\n"
-    columns = tuple(c for c in score.table.columns if c.name in _SCORES)
+    is_shown = _JUDGED[results.kind]
+    columns = tuple(c for c in score.table.columns if is_shown(c.name))
     which = "the best classical planner" if others[1:] else "the only classical planner judged"
     rows = (score.own, others[0])
     yield replace(score.table, title="", columns=columns, rows=rows).as_markdown()

@@ -16,6 +16,7 @@ from ms_slam_env.report.tables import Column, make_table
 
 OPTIONS = {"out": "runs/a", "seed": 3, "scenes": ["table"], "scene_seeds": 2, "episode_steps": 40}
 SCENES = ("table", "wall")
+NAMES = ("greedy", "agent-hand", "random")
 
 
 def scores(
@@ -198,6 +199,29 @@ def test_of_several_tasks_with_options_each_has_its_verdict(clone: Path) -> None
     text = card(clone)
     assert "### In `kitchen, reward=paper`\n" in text
     assert "80 [60, 90] % of pairs" in text
+
+
+def test_a_score_by_return_alone_has_its_own_columns_and_verdict(clone: Path) -> None:
+    lines = [{"planner": n, "return": -1.0 * k, "return_ate": -0.5} for k, n in enumerate(NAMES)]
+    won = [{"planner": "agent-hand", "greedy": Interval(0.8, 0.6, 0.9)}]
+    pairs = make_table(
+        ["planner", Column("greedy", "richer_share", "greedy")], won, "Share of starts, by return"
+    )
+    write_results(
+        clone / "docs/results/shares/results.json",
+        "reward_shares",
+        "Shares",
+        "About.",
+        [make_table(["planner", "return", "return_ate"], lines), pairs],
+        rows=[
+            {"spec": {"planner": n, "scene": "table"}, "result": {}, "error": None} for n in NAMES
+        ],
+        content={"config": {"task": "kitchen", "seeds": "7000-7003", "options": ("reward=x",)}},
+    )
+    text = card(clone)
+    assert "### In `kitchen, reward=x`\n\nOn the seeds 7000-7003:\n" in text
+    assert "| agent-hand | -1.0 | -0.50 |" in text
+    assert "By return: it beats `greedy`, the best classical planner (better in 80" in text
 
 
 def test_training_seeds_are_counted(clone: Path) -> None:
