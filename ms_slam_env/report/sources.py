@@ -33,7 +33,7 @@ PARTS: Mapping[str, tuple[str, ...]] = {
     "teams": ("slam/team", "metrics/multi_robot.py"),
     "planning": ("planning",),
     "sequences": ("sequences",),
-    "metrics": ("metrics", "evaluation", "benchmark/episode_scores.py", "report/statistics.py"),
+    "metrics": ("metrics", "evaluation", "benchmark/episode_scores.py"),
     "environment": ("env", "tasks.py", "benchmark/episodes.py"),
     "tuning": ("tuning",),
     "agents": ("ms_slam_agents:",),
