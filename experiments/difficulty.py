@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ms_slam_experiments.frame_skipping import LEAST_DEPTH_SHARE
 from ms_slam_experiments.shared import icl_nuim
 
 from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env.benchmark.experiment import Experiment
-from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, intensity_image
+from ms_slam_env.camera import XTION_SIZES, Intrinsics, RGBDFrame, intensity_image, xtion
 from ms_slam_env.config import Checked, bounded, chosen
 from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError
@@ -27,6 +28,7 @@ from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.charts import Chart, Panel, Series
 from ms_slam_env.report.statistics import rank_correlation
 from ms_slam_env.report.tables import Column, Row, Table, finished, flattened, grouped, make_table
+from ms_slam_env.scenes.scene import Scene
 from ms_slam_env.sensor.noise import noise_config
 from ms_slam_env.sensor.scene_cache import get_scene
 from ms_slam_env.sequences import Sequence as RGBDSequence
@@ -40,6 +42,7 @@ PAPER = {
     "lr_kt3": (0.0352, 0.0032, 0.0023),
 }
 """Table I of the paper: max, mean and "variance" of the intensity divergence."""
+_LOOK_EVERY = 10  # frames between those that are looked at
 RECORDING = "recorded depth"
 """Scene name of a recorded row."""
 
@@ -110,10 +113,12 @@ class Difficulty(Checked, Experiment):
         """The recording, and every motion at every place.
 
         A recorded motion appears once more, cut to the recording's length. The scale is the largest
-        at which all motions together fit at every place of every scene.
+        at which all motions together fit at the first places of every scene; places where the
+        camera is blind are replaced by later ones.
 
         Raises:
-            InputError: a scene, trajectory or recording that cannot be read, or no place.
+            InputError: a scene, trajectory or recording that cannot be read, or no place where the
+                motions fit and see something.
         """
         if self.data is None:
             raise InputError("--data is missing: the folder that holds icl_nuim")
@@ -124,6 +129,10 @@ class Difficulty(Checked, Experiment):
             for scene in self.scenes
             for seed in range(self.placements)
         )
+        seeing = {
+            scene: _places_that_see(get_scene(scene, 0), together, scale, self.placements)
+            for scene in self.scenes
+        }
         recorded = len(icl_nuim.recorded_depth(data, size, every))
         kinds = [(motion, 0) for motion in self.motions]
         if icl_nuim.RECORDED in self.motions:
@@ -136,7 +145,7 @@ class Difficulty(Checked, Experiment):
             )
             for noise in self.noise
             for scene in self.scenes
-            for seed in range(self.placements)
+            for seed in seeing[scene]
             for motion, first in kinds
         ]
 
@@ -220,6 +229,26 @@ class Difficulty(Checked, Experiment):
                    for kind, series in kinds.items()])
             for which, kinds in found.items()
         ]  # fmt: skip
+
+
+def _places_that_see(scene: Scene, poses: Float64, scale: float, count: int) -> list[int]:
+    """First ``count`` seeds of places where the motions are never blind; 20 places more are tried.
+
+    Raises:
+        InputError: too few.
+    """
+    found: list[int] = []
+    for seed in range(count + 20):
+        placed = place_trajectory(scene, poses, seed, scale).poses
+        few = render_sequence(scene, placed[::_LOOK_EVERY], xtion("80x60"), "none", seed).frames
+        if all(np.mean(frame.depth > 0) >= LEAST_DEPTH_SHARE for frame in few):
+            found.append(seed)
+        if len(found) == count:
+            return found
+    raise InputError(
+        f"scene {scene.name}: the motions see something all the way at {len(found)} places of "
+        f"{count + 20}, but {count} are asked for"
+    )
 
 
 def watch(spec: DifficultySpec) -> WatchedSequence:

@@ -18,7 +18,7 @@ from ms_slam_env.divergence import DivergenceConfig
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.run_sequence import run_backend
 from ms_slam_env.evaluation.sequence_divergence import KINDS, WASSERSTEIN, consecutive_distances
-from ms_slam_env.report.statistics import rank_correlation
+from ms_slam_env.report.statistics import Interval, rank_correlation_interval
 from ms_slam_env.report.tables import Row, Table, finished, flattened, make_table
 from ms_slam_env.sequences import HandheldPath, open_sequence
 from ms_slam_env.sequences import Sequence as RGBDSequence
@@ -104,8 +104,7 @@ class DifficultyErrors(Experiment, Checked):
     def tables(self, rows: Sequence[Row]) -> list[Table]:
         """Correlations of every measure with every backend's error, then the sequences."""
         count = len(finished(rows))
-        chance = 1.96 / max(1, count - 1) ** 0.5
-        note = f"Over {count} sequences; beyond +-{chance:.2f} it is unlikely (5 %) to be chance."
+        note = f"Over {count} sequences, with 95 % intervals by resampling sequences."
         errors = flattened(rows, "backends")
         lines = [{"sequence": one["spec"]["sequence"], **one["result"]} for one in errors]
         columns = ("measure", "divergence", "backend", *ERRORS.values())
@@ -132,11 +131,12 @@ def correlations(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return lines
 
 
-def _correlation(results: Sequence[Row], m: int, b: int, key: str) -> float:
+def _correlation(results: Sequence[Row], m: int, b: int, key: str) -> Interval:
     """Correlation of a measure and an error over sequences with both; NaN for fewer than three."""
     pairs = [(r["measures"][m]["difficulty"], r["backends"][b][key]) for r in results]
     known = [pair for pair in pairs if None not in pair and np.isfinite(pair).all()]
-    return rank_correlation(*zip(*known, strict=True)) if len(known) > 2 else float("nan")
+    pairs_known = zip(*known, strict=True) if len(known) > 2 else ((), ())
+    return rank_correlation_interval(*map(list, pairs_known))
 
 
 def _errors(backend: str, sequence: RGBDSequence) -> dict[str, Any]:

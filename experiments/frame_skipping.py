@@ -275,12 +275,12 @@ def correlations(rows: Sequence[Row]) -> Table:
 
     The interval resamples places, since the runs of one place at several intervals see the same.
     """
-    by: dict[tuple[str, str], list[list[Row]]] = {}
+    by: dict[tuple[str, str], list[list[Mapping[str, Any]]]] = {}
     for (backend, motion, *_), runs in grouped(
         rows, ("backend", "motion", "scene", "seed")
     ).items():
         by.setdefault((backend, motion), []).append(runs)
-    lines = [
+    lines: list[dict[str, Any]] = [
         {
             "backend": backend,
             "motion": motion or "hand-held",

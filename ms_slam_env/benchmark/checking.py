@@ -18,7 +18,7 @@ from ms_slam_env.config import from_dict
 from ms_slam_env.errors import InputError, one_line
 from ms_slam_env.metrics.registry import metric
 from ms_slam_env.report.discovery import find_results
-from ms_slam_env.report.records import RecordFile, Row, from_plain, to_plain
+from ms_slam_env.report.records import RecordFile, from_plain, to_plain
 from ms_slam_env.report.results import Results
 from ms_slam_env.report.sources import sources_of
 from ms_slam_env.report.tables import finished
@@ -33,7 +33,7 @@ _OTHERS_CODE = re.compile(r"(?!ms_slam_(env|baselines|agents)\b)[A-Za-z_][\w.]*:
 
 
 def check_results(
-    cls: type[Experiment], committed: Results, rows: Sequence[Row] = ()
+    cls: type[Experiment], committed: Results, rows: Sequence[Mapping[str, Any]] = ()
 ) -> tuple[int, list[str]]:
     """Run some committed rows again; return their count and a line for each value that differs.
 
@@ -67,7 +67,7 @@ def check_results(
     return len(chosen), differences
 
 
-def by_cost(committed: Results) -> list[Row]:
+def by_cost(committed: Results) -> list[Mapping[str, Any]]:
     """Return the finished rows, the cheapest first."""
     return sorted(finished(committed.rows), key=lambda row: row.get("elapsed_s", 0.0))
 

@@ -1,8 +1,8 @@
 """Digests of the code that makes results, by part, so that a record knows when it is older.
 
 A digest covers what a part's Python files say to the interpreter and its C++ headers to the
-compiler: comments, docstrings, layout and the wording of errors do not count. It does not depend
-on the version of Python.
+compiler: comments, docstrings, layout, types of local variables and the wording of errors do not
+count. It does not depend on the version of Python.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PARTS: Mapping[str, tuple[str, ...]] = {
     "teams": ("slam/team", "metrics/multi_robot.py"),
     "planning": ("planning",),
     "sequences": ("sequences",),
-    "metrics": ("metrics", "evaluation", "benchmark/episode_scores.py", "report/statistics.py"),
+    "metrics": ("metrics", "evaluation", "benchmark/episode_scores.py"),
     "environment": ("env", "tasks.py", "benchmark/episodes.py"),
     "tuning": ("tuning",),
     "agents": ("ms_slam_agents:",),
@@ -216,12 +216,15 @@ def _with_included(headers: set[str]) -> set[str]:
 def normalised(source: bytes) -> str:
     """The syntax tree of Python code as text, without what does not change results."""
     found: list[str] = []
-    _walk(ast.parse(source), found, is_raised=False)
+    _walk(ast.parse(source), found, False, False)
     return "\n".join(found)
 
 
-def _walk(node: ast.AST, found: list[str], is_raised: bool) -> None:
+def _walk(node: ast.AST, found: list[str], is_local: bool, is_raised: bool) -> None:
+    if is_local and isinstance(node, ast.AnnAssign) and node.value:  # its type does nothing
+        node = ast.Assign([node.target], node.value)
     found.append(type(node).__name__)
+    is_local = is_local or isinstance(node, ast.FunctionDef)
     is_raised = is_raised or isinstance(node, ast.Raise)
     for name in node._fields:
         value = getattr(node, name, None)
@@ -232,7 +235,7 @@ def _walk(node: ast.AST, found: list[str], is_raised: bool) -> None:
             if not isinstance(one, ast.AST):
                 found.append(repr(one))
             elif not _is_text(one, is_raised):
-                _walk(one, found, is_raised)
+                _walk(one, found, is_local, is_raised)
     found.append(".")
 
 

@@ -121,6 +121,26 @@ def rank_correlation(a: ArrayLike, b: ArrayLike) -> float:
     return float(stats.spearmanr(a, b).statistic)
 
 
+def rank_correlation_interval(a: ArrayLike, b: ArrayLike) -> Interval:
+    """Spearman's correlation of values (n,) and (n,), with the bootstrap interval over pairs.
+
+    NaN without values, or if one of them is constant.
+    """
+    from scipy import stats
+
+    if np.size(a) == 0 or np.ptp(a) == 0 or np.ptp(b) == 0:
+        return Interval(np.nan, np.nan, np.nan)
+
+    def spearman(*samples: Float64, axis: int = -1) -> Float64:
+        ranks = [stats.rankdata(sample, axis=axis) for sample in samples]
+        x, y = (rank - rank.mean(axis=axis, keepdims=True) for rank in ranks)
+        scale = np.sqrt((x * x).sum(axis=axis) * (y * y).sum(axis=axis))
+        found: Float64 = (x * y).sum(axis=axis) / np.where(scale == 0, 1.0, scale)
+        return found
+
+    return bootstrap_interval((a, b), spearman)
+
+
 def pooled_rank_correlation(groups: Sequence[tuple[ArrayLike, ArrayLike]]) -> Interval:
     """Spearman's correlation over the pairs of all groups, with its bootstrap interval.
 

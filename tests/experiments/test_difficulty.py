@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -113,3 +114,24 @@ def test_what_was_recorded_only_in_part_is_also_rendered_in_part(experiment, dat
 def test_bad_input(options, message, data):
     with pytest.raises(InputError, match=message):
         Difficulty(**{"data": data, **options}).specs()
+
+
+def test_places_without_depth_are_passed_over(experiment, monkeypatch):
+    def places():
+        return sorted({spec.placement for spec in experiment.specs() if spec.scene == "box"})
+
+    first = places()
+    assert len(first) == 1
+    real = difficulty.render_sequence
+
+    def blind_there(scene, poses, K, noise="kinect", seed=0, **given):
+        made = real(scene, poses, K, noise, seed, **given)
+        frames = [replace(frame, depth=frame.depth * (seed not in first)) for frame in made.frames]
+        return SimpleNamespace(frames=frames)
+
+    monkeypatch.setattr(difficulty, "render_sequence", blind_there)
+    assert len(places()) == 1
+    assert places() != first
+    monkeypatch.setattr(difficulty, "LEAST_DEPTH_SHARE", 1.1)
+    with pytest.raises(InputError, match="at 0 places of 21, but 1 are asked for"):
+        places()

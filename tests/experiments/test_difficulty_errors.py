@@ -37,9 +37,11 @@ def test_correlations_are_scipys_over_the_sequences() -> None:
     ate = [row["result"]["backends"][0]["ate_m"] for row in given]
     for m, name in enumerate(("kl", "earth-movers")):
         hard = [row["result"]["measures"][m]["difficulty"] for row in given]
-        assert found[name]["correlation_ate"] == pytest.approx(spearmanr(hard, ate).statistic)
-    assert found["kl"]["correlation_rpe"] == pytest.approx(1)
-    assert np.isnan(found["kl"]["correlation_lost"])  # nobody was lost: nothing to go with
+        correlation = found[name]["correlation_ate"]
+        assert correlation.value == pytest.approx(spearmanr(hard, ate).statistic)
+        assert -1 <= correlation.low < correlation.value < correlation.high <= 1
+    assert found["kl"]["correlation_rpe"].value == pytest.approx(1)
+    assert np.isnan(found["kl"]["correlation_lost"].value)  # nobody was lost: nothing to go with
     tables = DifficultyErrors().tables([*given, {"spec": {}, "result": None, "error": "broke"}])
     assert "Over 8 sequences" in tables[0].note
     assert correlations([]) == []

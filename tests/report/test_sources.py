@@ -41,6 +41,14 @@ def test_text_about_code_is_not_code() -> None:
     assert same(CODE.replace("# metres", "# m").replace("Of what.", "Of all."))
     assert same(CODE.replace('    """Clip a value."""\n', "").replace('"""A module."""', ""))
     assert same(CODE.replace("min(value, LIMIT)", "min(\n        value,\n        LIMIT,\n    )"))
+    typed = (
+        "    return min(value, LIMIT)",
+        "    found: float = min(value, LIMIT)\n    return found",
+    )
+    plain = ("    return min(value, LIMIT)", "    found = min(value, LIMIT)\n    return found")
+    one, other = (sources.normalised(CODE.replace(*pair).encode()) for pair in (typed, plain))
+    assert one == other
+    assert not same(CODE.replace("LIMIT = 0.5", "LIMIT: float = 0.5"))  # may be a field
     assert same(CODE.replace("is negative", "must be at least 0"))
     for old, new in (
         ("0.5", "0.25"),

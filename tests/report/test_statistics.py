@@ -165,3 +165,17 @@ def test_fishers_test_is_the_sum_of_no_likelier_tables() -> None:
         expected = chances[chances <= of.pmf(a) * (1 + 1e-9)].sum()
         flags = [np.arange(10) < count for count in (a, b)]
         assert statistics.fisher_p(*flags) == pytest.approx(expected)
+
+
+def test_a_rank_correlation_and_its_interval_are_scipys() -> None:
+    rng = np.random.default_rng(5)
+    a = rng.integers(0, 9, 40).astype(float)  # with ties
+    b = a + rng.normal(scale=3, size=40)
+    found = statistics.rank_correlation_interval(a, b)
+    assert found.value == pytest.approx(stats.spearmanr(a, b).statistic)
+    expected = stats.bootstrap(
+        (a, b), lambda x, y: stats.spearmanr(x, y).statistic, paired=True, vectorized=False,
+        n_resamples=999, method="percentile", rng=np.random.default_rng(1),
+    ).confidence_interval  # fmt: skip
+    assert (found.low, found.high) == pytest.approx(tuple(expected), abs=0.06)
+    assert np.isnan(statistics.rank_correlation_interval([1, 1, 1], [1, 2, 3]).value)
