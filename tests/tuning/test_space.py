@@ -172,9 +172,7 @@ def test_a_users_backend_has_the_parameters_of_its_constructor():
     assert space.defaults() == {"depth_max_m": 5.0, "window": 4, "image_size": "160x120"}
     assert space.parameters["window"] == Integer(2, 9)
     assert space.configuration({"depth_max_m": 2.0}).slam_config == {"window": 4, "depth_max_m": 2}
-    with pytest.raises(
-        InputError, match="unknown parameter 'depth'; .* depth_max_m, window, image"
-    ):
+    with pytest.raises(InputError, match=r"parameter 'depth'; .* depth_max_m, window, image"):
         make_space(["depth=1:8"], base)
-    with pytest.raises(InputError, match="group 'algorithm' of parameters does not fit backend '"):
+    with pytest.raises(InputError, match=r"group 'algorithm' of parameters does not fit backend '"):
         make_space(["algorithm"], base)
