@@ -195,7 +195,8 @@ def _warn_of_misfit(run: SequenceRun, sequence: Sequence) -> None:
     found = [
         f"the tracked poses do not fit the true ones: {one}" for one in complaints(P[ok], Q[ok])
     ]
-    if not found and is_turn_open(metrics.find_alignment(P, Q).poses(P), Q):
+    alignment = metrics.find_alignment(P, Q)
+    if not found and alignment.unique and is_turn_open(alignment.poses(P), Q):
         found = [f"{TURN_IS_OPEN} (ate_rad); rpe_rad needs no alignment"]
     for text in found:
         warnings.warn(f"{sequence.name}: {text}", InputWarning, stacklevel=2)

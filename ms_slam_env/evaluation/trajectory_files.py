@@ -155,7 +155,7 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
     found = complaints(raw, true, share, options.align == "sim3")
     for complaint in found:
         warnings.warn(f"{truth} may be of another recording: {complaint}", InputWarning, 2)
-    by_positions = options.align in ("se3", "sim3")
+    by_positions = options.align in ("se3", "sim3") and alignment.unique
     if by_positions and not found and is_turn_open(alignment.poses(raw), true):
         warnings.warn(f"{truth}: {TURN_IS_OPEN}; --align origin needs no path", InputWarning, 2)
     if len(first) < _LEAST_SHARE * len(times):
