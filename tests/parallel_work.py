@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
+import warnings
 from typing import Any
 
 from tqdm import tqdm
 
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, InputWarning
 
 
 def work(spec: int) -> dict[str, Any]:
-    """Square ``spec``, with a bar; below zero it complains, 13 kills the process."""
+    """Square ``spec``, with a bar; it warns of 7, complains below zero, and 13 ends the process."""
     tqdm([spec], disable=True)
+    if spec == 7:
+        warnings.warn("7 is prime", InputWarning, stacklevel=1)
     if spec == 13:
         os._exit(3)
     if spec < 0:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from parallel_work import work
 
 from ms_slam_env._runtime.parallel import Outcome, open_pool, run_each
 from ms_slam_env._runtime.threads import available_cores, limited_threads, thread_environment
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, InputWarning
 
 
 class Unreadable:
@@ -44,6 +45,16 @@ def test_workers_that_show_bars_leave_no_semaphore_behind() -> None:
         check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_warning_of_workers_is_one_of_this_process(capfd: pytest.CaptureFixture[str]) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        with open_pool(work, workers=1, fresh=True) as pool:
+            found = list(run_each(pool, {"a": 7, "b": 2, "c": 7}))
+    assert [outcome.warnings for outcome in found] == [("7 is prime",), (), ("7 is prime",)]
+    assert [(one.category, str(one.message)) for one in caught] == [(InputWarning, "7 is prime")]
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("ray_address", [None, "local"])

@@ -8,6 +8,7 @@ import io
 import os
 import re
 import select
+import shlex
 import signal
 import sys
 import warnings
@@ -189,6 +190,11 @@ def _show_warning(
     ours = issubclass(category, InputWarning)
     place = "" if ours else f" ({category.__name__} in {where[0]}, line {where[1]})"
     print(f"{name}: warning: {one_line(message)}{place}", file=sys.stderr)
+
+
+def for_a_page(folder: Path) -> str:
+    """End of a line about written results: how to look at them."""
+    return f"; for a page of them: ms-slam report {shlex.quote(str(folder))}"
 
 
 def report_failures(errors: Sequence[str], name: str = "ms-slam") -> int:

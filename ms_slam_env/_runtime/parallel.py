@@ -27,6 +27,7 @@ import signal
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -38,7 +39,7 @@ from typing import Any, Protocol
 from tqdm import tqdm
 
 from ms_slam_env._runtime.threads import available_cores
-from ms_slam_env.errors import InputError
+from ms_slam_env.errors import InputError, InputWarning
 
 LOCAL_CLUSTER = "local"
 """Address that starts a Ray cluster on this machine for the lifetime of the pool."""
@@ -60,6 +61,7 @@ class Outcome:
         is_bad_input: whether it was an ``InputError``.
         died: whether the worker died.
         elapsed_s: time by the clock, seconds.
+        warnings: what it warned of about input; the pool repeats it in this process.
     """
 
     key: Any
@@ -71,6 +73,7 @@ class Outcome:
     is_bad_input: bool = False
     died: bool = False
     elapsed_s: float = 0.0
+    warnings: tuple[str, ...] = ()
 
 
 def attempt(run: Run, key: Any, spec: Any) -> Outcome:
@@ -184,6 +187,8 @@ class Pool:
             message = f"the process died{error}"
             elapsed_s = round(time.perf_counter() - start, 3)
             outcome = Outcome(key, None, message, message, died=True, elapsed_s=elapsed_s)
+        for text in outcome.warnings:
+            warnings.warn(text, InputWarning, stacklevel=2)
         if self._fresh or outcome.died:
             worker.stop()
         else:
@@ -323,13 +328,30 @@ def _serve(pipe: Connection, begun: Connection, run: Run) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()  # the parent may be killed
+    warned = _collect_input_warnings()
     while True:
         try:
             spec = pipe.recv()
         except EOFError:
             return
         begun.send_bytes(b"1")
-        pipe.send(attempt(run, None, spec))
+        pipe.send(replace(attempt(run, None, spec), warnings=tuple(warned)))
+        warned.clear()
+
+
+def _collect_input_warnings() -> list[str]:
+    """From now on add warnings about input to a list, so that several workers say them once."""
+    warned: list[str] = []
+    show = warnings.showwarning
+
+    def collect(message: Warning | str, category: type[Warning], *args: Any, **more: Any) -> None:
+        if issubclass(category, InputWarning):
+            warned.append(str(message))
+        else:
+            show(message, category, *args, **more)
+
+    warnings.showwarning = collect
+    return warned
 
 
 # -- A Ray cluster -----------------------------------------------------------------------------

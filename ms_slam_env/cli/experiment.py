@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from ms_slam_env._runtime.command_line import parse, report_failures
+from ms_slam_env._runtime.command_line import for_a_page, parse, report_failures
 from ms_slam_env.benchmark import (
     EXPERIMENTS,
     HAS_RESEARCH,
@@ -45,7 +45,8 @@ def run(cls: type[Experiment], arguments: Sequence[str], program: str, out: Path
     own = {field.name: getattr(args, field.name) for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     outcome = run_experiment(cls(**own), args.out, args.workers, args.ray)
     print(outcome.results.as_markdown())
-    print(f"written: {args.out}/{RESULTS}, table.md and figures", file=sys.stderr)
+    page = for_a_page(args.out)
+    print(f"written: {args.out}/{RESULTS}, table.md and figures{page}", file=sys.stderr)
     return report_failures(outcome.failures)
 
 

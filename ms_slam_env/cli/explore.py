@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ms_slam_env._runtime.command_line import parse, report_failures
+from ms_slam_env._runtime.command_line import for_a_page, parse, report_failures
 
 
 @dataclass(frozen=True)
@@ -117,5 +118,7 @@ def main(arguments: Sequence[str]) -> int:
     )
     results = run_exploration(exploration, args.out, args.trials, args.workers, args.ray)
     print(results.as_markdown())
+    made = f"explore.json, table.md, figures and configurations (*.yaml){for_a_page(args.out)}"
+    print(f"written: {args.out}/{made}", file=sys.stderr)
     failed = [row["result"].get(FAILURE) for row in results.rows]
     return report_failures(failed if all(failed) else [])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from ms_slam_env._runtime.command_line import parse
+from ms_slam_env._runtime.command_line import for_a_page, parse
 from ms_slam_env._runtime.output_files import check_out_file
 from ms_slam_env.errors import InputError
 
@@ -88,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
     from ms_slam_env.camera.image_size import ImageSizeError
     from ms_slam_env.config import from_dict, nested_options
     from ms_slam_env.evaluation.run_sequence import lost_throughout
-    from ms_slam_env.evaluation.run_to_folder import run_to_folder
+    from ms_slam_env.evaluation.run_to_folder import WRITTEN, run_to_folder
     from ms_slam_env.sequences import open_sequence
     from ms_slam_env.sequences.recording import Topics, parse_calibration
     from ms_slam_env.slam.configuration import (
@@ -161,6 +161,8 @@ def main(arguments: Sequence[str]) -> int:
         print(f"{'ene_model_j':16} {result['ene_model_j']:.4g} ({result['energy_source']})")
     for reason in result["lost_reasons"]:
         print(f"lost {reason}", file=sys.stderr)
+    written = [name for name in WRITTEN if (args.out / name).exists()]
+    print(f"written: {args.out}/{', '.join(written)}{for_a_page(args.out)}", file=sys.stderr)
     complaint = lost_throughout(result["processed_frames"], result["lost_frames"])
     if complaint:
         raise RuntimeError(f"sequence {sequence.name}: {complaint}")

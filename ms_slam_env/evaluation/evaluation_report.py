@@ -135,9 +135,9 @@ def evaluate_trajectories(estimate: Path, truth: Path, options: TrajectoryOption
 
 def trajectory_summary(found: Found, options: TrajectoryOptions) -> str:
     """Lines for a terminal."""
-    unit = "" if options.delta_unit == "frames" else f" {options.delta_unit}"
+    unit = "frame" if (options.delta, options.delta_unit) == (1, "frames") else options.delta_unit
     lines = [
-        f"{_matched(found)}, alignment {_alignment(options)}, delta {options.delta}{unit}"
+        f"{_matched(found)}, alignment {_alignment(options)}, RPE over {options.delta} {unit}"
         + (f", scale {found['scale']:.6f}" if options.align == "sim3" else "")
     ]
     for key in _errors(options):

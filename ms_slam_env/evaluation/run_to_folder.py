@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
@@ -15,6 +16,7 @@ from ms_slam_env._runtime.arrays import Float64
 from ms_slam_env._runtime.interrupts import recorded
 from ms_slam_env._runtime.output_files import growing_file, write_bytes
 from ms_slam_env._runtime.result_folders import alone_in, result_folder
+from ms_slam_env.errors import InputWarning
 from ms_slam_env.evaluation.run_files import (
     COSTS,
     MESH,
@@ -40,6 +42,7 @@ from ms_slam_env.evaluation.tracking_diagnosis import (
     lost_table,
 )
 from ms_slam_env.evaluation.trajectory_charts import error_panel, marked_panel, path_panel
+from ms_slam_env.evaluation.trajectory_files import TURN_IS_OPEN, complaints, is_turn_open
 from ms_slam_env.geometry import invert
 from ms_slam_env.report.charts import Chart, Panel
 from ms_slam_env.report.results import write_results
@@ -59,6 +62,8 @@ TRAJECTORY, UNFINISHED = "trajectory.txt", "trajectory.incomplete.txt"
 CORRECTED, TRUTH = "trajectory.corrected.txt", "groundtruth.txt"
 MAP, FRAMES, METRICS = "map.ply", "frames.csv", "metrics.json"
 SUBMAPS = "submaps.csv"
+WRITTEN = (METRICS, TRAJECTORY, CORRECTED, TRUTH, MAP, MESH, FRAMES, SUBMAPS, REFUSED)
+"""Files that a finished run may leave in its folder."""
 
 _ABOUT = "A SLAM backend over a sequence: its path, its error, what each frame cost."
 _TABLES = {
@@ -152,7 +157,7 @@ def _run(
     mesh: bool,
 ) -> dict[str, Any]:
     """Track and write, while no other process uses ``out``."""
-    for old in (METRICS, TRAJECTORY, CORRECTED, TRUTH, MAP, MESH, FRAMES, SUBMAPS, REFUSED):
+    for old in WRITTEN:
         (out / old).unlink(missing_ok=True)
     try:
         with growing_file(out / UNFINISHED) as add:
@@ -160,6 +165,8 @@ def _run(
             for step in run:
                 add(trajectory_line(step.frame.timestamp, step.result.T_world_camera))
                 refused.look(run, step)
+                if map_out is not None and len(run) == 1:  # not after an hour of work
+                    check_saves(run.backend)
         if map_out is not None:
             run.backend.save(map_out)
         result = _write(run, sequence, out, {"complete": True, **content}, refused, mesh)
@@ -173,7 +180,26 @@ def _run(
                 error.args = (f"{len(run)} of {len(sequence)} frames are kept in {out}",)
         raise
     (out / UNFINISHED).unlink()
+    _warn_of_misfit(run, sequence)
     return result
+
+
+def _warn_of_misfit(run: SequenceRun, sequence: Sequence) -> None:
+    """Warn where the poses of tracked frames in one map look as if the truth were not theirs."""
+    if len(run.backend.submaps()) > 1:
+        return
+    times, P, Q = _pairs(run, run.estimates, sequence)
+    ok = run.tracking_ok[np.isin(run.timestamps, times)]
+    if ok.sum() < 2:
+        return
+    found = [
+        f"the tracked poses do not fit the true ones: {one}" for one in complaints(P[ok], Q[ok])
+    ]
+    alignment = metrics.find_alignment(P, Q)
+    if not found and alignment.unique and is_turn_open(alignment.poses(P), Q):
+        found = [f"{TURN_IS_OPEN} (ate_rad); rpe_rad needs no alignment"]
+    for text in found:
+        warnings.warn(f"{sequence.name}: {text}", InputWarning, stacklevel=2)
 
 
 def _write(

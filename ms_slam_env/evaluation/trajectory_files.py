@@ -31,7 +31,12 @@ _LEAST_SHARE = 0.5  # of the poses of the shorter trajectory that must correspon
 _MOST_EXTENT = 3.0  # largest ratio of the extents of the two trajectories
 _LEAST_SPREAD_M = 0.02  # below this the truth stands still, and nothing more can be checked
 _MOST_SPREAD = 0.7  # above this, alignment explains less than half of the positions' variance
-_MOST_TURN_DEG = 30.0  # of the median pose
+_MOST_TURN = np.pi / 6  # of the median pose; rad
+_FITS = 0.2  # of that spread: an error below this, after a change of scale, is no accident
+TURN_IS_OPEN = (
+    "the path is too straight or short, for errors as large, to align orientations by positions: "
+    "their ATE says little"
+)
 _FRAME_COLUMNS = ("timestamp", "tracking_ok")
 _BESIDE = "frames.csv"  # written by ms-slam run into the folder of the estimate
 
@@ -174,9 +179,12 @@ def match_files(estimate: Path, truth: Path, options: TrajectoryOptions) -> Matc
     raw, true = poses[first], true_poses[second]
     alignment = metrics.find_alignment(raw, true, options.align, options.align_first)
     share = len(first) / min(len(times), len(true_times))
-    best = metrics.find_alignment(raw, true, "sim3" if options.align == "sim3" else "se3")
-    for complaint in complaints(best.poses(raw), true, share, best.unique):
+    found = complaints(raw, true, share, options.align == "sim3")
+    for complaint in found:
         warnings.warn(f"{truth} may be of another recording: {complaint}", InputWarning, 2)
+    by_positions = options.align in ("se3", "sim3") and alignment.unique
+    if by_positions and not found and is_turn_open(alignment.poses(raw), true):
+        warnings.warn(f"{truth}: {TURN_IS_OPEN}; --align origin needs no path", InputWarning, 2)
     if len(first) < _LEAST_SHARE * len(times):
         text = f"{estimate}: only {len(first)} of {len(times)} poses have a true one in {truth}"
         warnings.warn(text, InputWarning, 2)
@@ -257,15 +265,19 @@ def _covered(times: Float64, gaps: Float64, true_times: Float64) -> float:
     return float((lengths[0] - lengths[1:].sum()) / (last - first)) if last > first else 1.0
 
 
-def complaints(aligned: Float64, truth: Float64, share: float, is_turned: bool = True) -> list[str]:
+def complaints(
+    estimate: Float64, truth: Float64, share: float = 1.0, with_scale: bool = False
+) -> list[str]:
     """Signs that two trajectories are not of the same recording.
 
     Args:
-        aligned: (N, 4, 4) estimate after the best alignment.
+        estimate: (N, 4, 4).
         truth: (N, 4, 4) at the same times.
         share: share of the shorter trajectory's poses that correspond.
-        is_turned: whether the positions determine the rotation of the alignment.
+        with_scale: whether the scale of the estimate is free.
     """
+    alignment = metrics.find_alignment(estimate, truth, "sim3" if with_scale else "se3")
+    aligned = alignment.poses(estimate)
     found = []
     if share < _LEAST_SHARE:
         found.append(f"only {share:.0%} of the poses of the shorter trajectory correspond in time")
@@ -278,6 +290,7 @@ def complaints(aligned: Float64, truth: Float64, share: float, is_turned: bool =
     if large > _MOST_EXTENT * small:
         found.append(
             f"the estimate extends over {extents[0]:.3g} m, the truth over {extents[1]:.3g} m"
+            + _fitting_scale(estimate, truth, spread_m)
         )
     error_m = metrics.ate_rmse(aligned, truth, align="none")
     if error_m > _MOST_SPREAD * spread_m:
@@ -285,15 +298,40 @@ def complaints(aligned: Float64, truth: Float64, share: float, is_turned: bool =
             f"the aligned estimate is {error_m:.3g} m off where the true positions themselves lie "
             f"{spread_m:.3g} m around their mean"
         )
-    elif is_turned:
+    elif alignment.unique and not is_turn_open(aligned, truth):
         angles = metrics.absolute_errors(aligned, truth, "none", "rotation")
         off_deg = float(np.degrees(np.median(angles)))
-        if off_deg > _MOST_TURN_DEG:
+        if off_deg > np.degrees(_MOST_TURN):
             found.append(
                 f"where positions fit, orientations are {off_deg:.3g} deg off (median), as of "
                 "another body or of quaternions that begin with qw"
             )
     return found
+
+
+def is_turn_open(aligned: Float64, truth: Float64) -> bool:
+    """Whether the errors of positions may have turned their alignment by 30 degrees or more.
+
+    Poses are (N, 4, 4). An error of e may turn a path about its best line by about e over the
+    distance d of the path from it (RMS both).
+    """
+    centred = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
+    beside_m = np.linalg.norm(np.linalg.svd(centred, compute_uv=False)[1:]) / len(truth) ** 0.5
+    return bool(metrics.ate_rmse(aligned, truth, align="none") >= _MOST_TURN * beside_m)
+
+
+def _fitting_scale(estimate: Float64, truth: Float64, spread_m: float) -> str:
+    """Name the scale that makes the estimate fit; nothing if none does."""
+    if np.ptp(estimate[:, :3, 3], axis=0).max() < 1e-6:
+        return ""  # it stands still
+    scaled = metrics.find_alignment(estimate, truth, "sim3")
+    error_m = metrics.ate_rmse(scaled.poses(estimate), truth, align="none")
+    if error_m > _FITS * spread_m:
+        return ""
+    return (
+        f"; times {scaled.scale:.3g} it fits, as with a wrong depth scale or with one camera, for "
+        "which --align sim3 is meant"
+    )
 
 
 def tracked_beside(estimate: Path, times: Float64) -> NDArray[np.bool_] | None:

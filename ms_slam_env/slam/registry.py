@@ -5,6 +5,7 @@ Loading kernels takes a while, and an optional dependency may be missing.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -109,6 +110,12 @@ def check_parameters(name: object, params: object) -> Any:
     if entry.has_devices:
         _check_device(options.pop("device", "cpu"))
     return from_dict(entry.load(entry.config), options, "slam_config")
+
+
+def given_or_default(name: object, params: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a user's backend class: ``params``, and what its constructor has by default."""
+    options = inspect.signature(POINT.find(name)).parameters.values()
+    return {p.name: p.default for p in options if p.default is not p.empty} | dict(params)
 
 
 def _check_device(device: object) -> None:

@@ -12,6 +12,7 @@ from ms_slam_env.errors import InputError, unknown
 from ms_slam_env.slam import check_parameters
 from ms_slam_env.slam.configuration import SlamConfiguration, merged
 from ms_slam_env.slam.machine import clock_range_mhz, why_no_clock
+from ms_slam_env.slam.registry import given_or_default
 from ms_slam_env.slam.surfel.surfel_config import PAPER
 from ms_slam_env.tuning.parameters import Choice, Float, Integer, Parameter
 
@@ -183,6 +184,8 @@ def default_of(name: str, base: SlamConfiguration) -> Any:
     if name == _LEVELS:
         return len(default_of("iterations", base))
     found: Any = check_parameters(base.slam, base.slam_config)
+    if isinstance(found, dict):  # a user's class has no dataclass of its options
+        found = given_or_default(base.slam, found)
     if name.startswith(_COMPILER_PREFIX):
         found, name = base.compiler_options(), name.removeprefix(_COMPILER_PREFIX)
     for part in name.split("."):
@@ -190,8 +193,10 @@ def default_of(name: str, base: SlamConfiguration) -> Any:
             found = found[int(part)]
         elif dataclasses.is_dataclass(found) and part in found.__dataclass_fields__:
             found = getattr(found, part)
+        elif isinstance(found, dict) and part in found:
+            found = found[part]
         else:
-            valid = [*KNOWN, *_OF_CONFIGURATION]
+            valid = [*(found if isinstance(found, dict) else KNOWN), *_OF_CONFIGURATION]
             if dataclasses.is_dataclass(found):
                 valid = [*found.__dataclass_fields__, *_OF_CONFIGURATION, *GROUPS]
             raise unknown("parameter", name, dict.fromkeys(valid))
@@ -219,7 +224,13 @@ def make_space(texts: Sequence[str], base: SlamConfiguration | None = None) -> S
                 continue
             if absent:
                 raise InputError(f"parameter {member!r} is absent: {absent}")
-            default = default_of(member, base)
+            try:
+                default = default_of(member, base)
+            except InputError as error:
+                if name not in GROUPS:
+                    raise
+                misfit = f"group {name!r} of parameters does not fit backend {base.slam!r}"
+                raise InputError(f"{misfit}: {error}") from None
             if equals:
                 parameters[member] = _parse_values(member, values, default)
             elif member == "cpu_mhz":

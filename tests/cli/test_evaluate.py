@@ -23,7 +23,7 @@ from ms_slam_env.cli import main
 from ms_slam_env.errors import InputError
 from ms_slam_env.evaluation.map_files import MapOptions, evaluate_maps
 from ms_slam_env.evaluation.run_files import write_ply
-from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions
+from ms_slam_env.evaluation.trajectory_files import TrajectoryOptions, complaints
 from ms_slam_env.evaluation.trajectory_measures import absolute_key, evaluate_files, statistic_keys
 from ms_slam_env.geometry import invert, make_pose, se3_exp, so3_exp, transform_points
 from ms_slam_env.sequences import read_trajectory, write_trajectory
@@ -241,6 +241,36 @@ def test_a_truth_of_another_recording_is_complained_about(
         said = capsys.readouterr().err
         assert "other.txt may be of another recording" in said
         assert complaint in said
+
+
+def test_a_scale_that_fits_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    estimate, truth = write_pair(tmp_path, scale=5.0)
+    assert main(["evaluate", estimate, truth]) == 0
+    assert "times 0.2 it fits, as with a wrong depth scale" in capsys.readouterr().err
+    assert main(["evaluate", estimate, truth, "--align", "sim3"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_turn_that_the_positions_leave_open_is_not_complained_about(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Three millimetres beside a straight path, with errors as large, the turn about it is free."""
+    rng = np.random.default_rng(0)
+    truth = np.tile(np.eye(4), (40, 1, 1))
+    truth[:, 0, 3] = np.linspace(0.0, 0.4, 40)
+    truth[:, :3, 3] += rng.normal(0.0, 0.003, (40, 3))
+    turned = truth @ se3_exp([0, 0, 0, 1.0, 0, 0])
+    assert "57.3 deg" in complaints(turned, truth)[0]  # here the positions are exact
+    turned[:, :3, 3] += rng.normal(0.0, 0.003, (40, 3))
+    assert complaints(turned, truth) == []
+    times = np.arange(40.0)
+    pair = [str(tmp_path / name) for name in ("estimate.txt", "truth.txt")]
+    write_trajectory(pair[0], times, turned)
+    write_trajectory(pair[1], times, truth)
+    assert main(["evaluate", *pair]) == 0
+    assert "the path is too straight or short" in one_line(capsys.readouterr().err)
+    assert main(["evaluate", *pair, "--align", "origin"]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def _moved(poses: np.ndarray, positions: np.ndarray) -> np.ndarray:

@@ -136,7 +136,43 @@ def test_writes_trajectory_map_and_metrics(sequence, tmp_path, capsys):
     assert len(cloud.vertices) > 1000
     raw = cloud.metadata["_ply_raw"]["vertex"]["properties"]
     assert {"red", "nx", "ny", "nz", "radius", "confidence"} <= set(raw)
-    assert "ate_m" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "ate_m" in said.out
+    assert f"written: {out}/metrics.json, trajectory.txt, groundtruth.txt, map.ply" in said.err
+
+
+def test_a_scale_that_is_not_that_of_the_truth_is_complained_about(sequence, tmp_path, capsys):
+    folder = shutil.copytree(sequence, tmp_path / "box")
+    times, poses = read_trajectory(folder / "groundtruth.txt")
+    poses[:, :3, 3] *= 5
+    write_trajectory(folder / "groundtruth.txt", times, poses)
+    assert main(["run", str(folder), "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().err
+    assert "box: the tracked poses do not fit the true ones: the estimate extends over 0.0" in said
+    times_it = re.search(r"; times (\S+) it fits, as with a wrong depth scale", said)
+    assert float(times_it[1]) == pytest.approx(5, rel=0.1)
+
+
+@pytest.mark.parametrize(("map_out", "code"), [(True, 2), (False, 0)])
+def test_a_map_that_cannot_be_saved_is_refused_at_its_first_frame(
+    map_out, code, sequence, tmp_path, capsys, monkeypatch
+):
+    (tmp_path / "last_frame.py").write_text(
+        "from ms_slam_env.slam.surfel import SurfelSlam\n"
+        "class LastFrame(SurfelSlam):\n"
+        "    last = None\n"
+        "    def get_state(self): return {**super().get_state(), 'last': self.last}\n"
+        "    def track(self, frame, *given):\n"
+        "        self.last = frame\n"
+        "        return super().track(frame, *given)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    options = ["--map-out", str(tmp_path / "map.npz")] * map_out
+    options += ["--backend", "last_frame:LastFrame", "--out", str(tmp_path / "out")]
+    assert main(["run", str(sequence), *options]) == code
+    assert ("state.last is a RGBDFrame" in capsys.readouterr().err) == map_out
+    written = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert written["frames"] == (1 if map_out else FRAMES)
 
 
 @pytest.mark.parametrize(("rows", "said"), [(2, "are measured"), (1, "need two and are not meas")])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from ms_slam_env.errors import InputError
 from ms_slam_env.slam.configuration import SlamConfiguration
-from ms_slam_env.slam.surfel import SurfelConfig
+from ms_slam_env.slam.surfel import SurfelConfig, SurfelSlam
 from ms_slam_env.slam.surfel.surfel_config import PAPER
 from ms_slam_env.tuning import Choice, Float, Integer, make_space
 from ms_slam_env.tuning.space import GROUPS, KNOWN, absences, why_absent
@@ -160,3 +160,19 @@ def test_bad_parameters_are_one_line(texts, message):
         make_space(texts)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+class _Own(SurfelSlam):
+    def __init__(self, intrinsics, depth_max_m: float = 5.0, window: int = 3) -> None: ...
+
+
+def test_a_users_backend_has_the_parameters_of_its_constructor():
+    base = SlamConfiguration(slam=f"{__name__}:_Own", slam_config={"window": 4})
+    space = make_space(["depth_max_m=1:8", "window=2:9", "image_size=80x60,160x120"], base)
+    assert space.defaults() == {"depth_max_m": 5.0, "window": 4, "image_size": "160x120"}
+    assert space.parameters["window"] == Integer(2, 9)
+    assert space.configuration({"depth_max_m": 2.0}).slam_config == {"window": 4, "depth_max_m": 2}
+    with pytest.raises(InputError, match=r"parameter 'depth'; .* depth_max_m, window, image"):
+        make_space(["depth=1:8"], base)
+    with pytest.raises(InputError, match=r"group 'algorithm' of parameters does not fit backend '"):
+        make_space(["algorithm"], base)
