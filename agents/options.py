@@ -160,7 +160,8 @@ class Training(Problem):
         super().__post_init__()
         for name in ("also", "curriculum", "through") if self.batched != "no" else ():
             if getattr(self, name):
-                raise InputError(f"batched = {self.batched!r}: a batch has no {name}")
+                without = "; --also without a name leaves it out" if name == "also" else ""
+                raise InputError(f"batched = {self.batched!r}: a batch has no {name}{without}")
 
 
 @dataclass(frozen=True)
