@@ -41,7 +41,8 @@ class Problem(Checked):
             some ten, for a free camera the environment's default. With ``--embodiment arm-kinematic
             --frames-per-action 1`` a step costs little more than the free camera's, which suits
             pretraining for the arm itself (``--init``).
-        reward: `divergence-and-error`, `mapping` or `paper`; `default`: the environment's own.
+        reward: `divergence-and-error`, `mapping` or `paper`; `default`: `mapping` in the id of a
+            task, else `divergence-and-error`.
         without: reward terms to ignore.
         image_size: of the camera in training and validation, width x height; None: the
             environment's default. At 80x60 a step costs half as much, and SLAM loses track more
