@@ -47,13 +47,13 @@ class BatchedVecEnv(VecEnv):
         """See the base class."""
         observations, rewards, terminated, truncated, info = self.envs.step(self._actions)
         ended = terminated | truncated
-        terms = info["reward_terms"]
-        last_terms = info["final_info"]["reward_terms"] if ended.any() else terms
+        last = info["final_info"] if ended.any() else info
         infos: list[dict[str, Any]] = []
         for env in range(self.num_envs):
-            own = last_terms if ended[env] else terms
-            named = {name: float(of[env]) for name, of in own.items() if name[0] != "_"}
-            infos.append({"reward_terms": named})
+            own = last if ended[env] else info
+            terms = own["reward_terms"].items()
+            named = {name: float(of[env]) for name, of in terms if name[0] != "_"}
+            infos.append({"reward_terms": named, "action_mask": own["action_mask"][env]})
             if ended[env]:
                 infos[env]["terminal_observation"] = info["final_obs"][env]
                 infos[env]["TimeLimit.truncated"] = bool(truncated[env] and not terminated[env])

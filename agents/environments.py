@@ -22,9 +22,9 @@ from ms_slam_agents.through_planner import ThroughPlanner
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 import ms_slam_env  # registers the ids, in a worker process too
-from ms_slam_env.env.reward import DEFAULT
+from ms_slam_env.env.reward import DEFAULT, DIVERGENCE_AND_ERROR, MAPPING
 from ms_slam_env.errors import InputError, unknown
-from ms_slam_env.gym_ids import BATCHED_IDS
+from ms_slam_env.gym_ids import BATCHED_IDS, ENV_IDS, PERTURBED_ENV_IDS, TASK_IDS
 
 VALIDATION_SEED = 1_000_000  # of the first validation episode; training draws from small seeds
 
@@ -136,11 +136,22 @@ def say_problem(args: Problem) -> None:
     """Print the problem at the start of a training."""
     also = getattr(args, "also", ())
     worlds = [world_of(args, k) for k in range(1 + len(also))]
-    places = [f"{world.env_id} ({', '.join(world.scenes)})" for world in worlds]
+    places = [
+        f"{world.env_id} ({', '.join(world.scenes)}), reward {_reward_of(world)}"
+        for world in worlds
+    ]
     shares = [
         f"{place}, as --also {name} says" for name, place in zip(also, places[1:], strict=True)
     ]
     print("; and in ".join([f"trains in {places[0]}", *shares]), flush=True)
+
+
+def _reward_of(problem: Problem) -> str:
+    """Name of the reward; a policy trained for another one is easily compared by mistake."""
+    if problem.reward != DEFAULT:
+        return problem.reward
+    by_id = dict.fromkeys((*ENV_IDS, *PERTURBED_ENV_IDS), DIVERGENCE_AND_ERROR)
+    return (by_id | dict.fromkeys(TASK_IDS, MAPPING)).get(problem.env_id, "its own")
 
 
 def _spaces_in(args: Problem, split: str) -> tuple[Any, Any]:

@@ -103,8 +103,8 @@ class Curve:
             RESULTS,
             kind="train",
             title="A policy while it is trained",
-            about="Scores on validation episodes, always the same with the same random numbers, "
-            "beside planners that are not trained.",
+            about="Scores on the same validation episodes with the same random numbers each time, "
+            "beside planners without training. Returns compare only under the same reward.",
             tables=self._tables(),
             charts=[self._chart()] if self.points else [],
             rows=self._rows(),

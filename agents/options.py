@@ -41,7 +41,8 @@ class Problem(Checked):
             some ten, for a free camera the environment's default. With ``--embodiment arm-kinematic
             --frames-per-action 1`` a step costs little more than the free camera's, which suits
             pretraining for the arm itself (``--init``).
-        reward: `divergence-and-error`, `mapping` or `paper`; `default`: the environment's own.
+        reward: `divergence-and-error`, `mapping` or `paper`; `default`: `mapping` in the id of a
+            task, else `divergence-and-error`.
         without: reward terms to ignore.
         image_size: of the camera in training and validation, width x height; None: the
             environment's default. At 80x60 a step costs half as much, and SLAM loses track more
@@ -160,7 +161,8 @@ class Training(Problem):
         super().__post_init__()
         for name in ("also", "curriculum", "through") if self.batched != "no" else ():
             if getattr(self, name):
-                raise InputError(f"batched = {self.batched!r}: a batch has no {name}")
+                without = "; --also without a name leaves it out" if name == "also" else ""
+                raise InputError(f"batched = {self.batched!r}: a batch has no {name}{without}")
 
 
 @dataclass(frozen=True)

@@ -267,7 +267,7 @@ class Run(TrainingRun):
                 return None
             before = self.played // args.train_every
             self._step()
-            if self.played < args.learning_starts:
+            if self.played < args.learning_starts or not len(self.replay):  # n steps fill it
                 continue
             for _ in range(self.played // args.train_every - before):
                 losses.append(self.learner.learn(self.replay.draw(self.rng, args.batch_size)))

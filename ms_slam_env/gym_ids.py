@@ -95,6 +95,7 @@ def register_all() -> None:
             single = gymnasium.spec(batched_id.removeprefix("batched/"))
             gymnasium.register(
                 batched_id,
+                entry_point="ms_slam_env.env.batched.make:refuse_single",
                 vector_entry_point="ms_slam_env.env.batched.make:make_batched",
                 max_episode_steps=single.max_episode_steps,
                 kwargs=single.kwargs,

@@ -53,6 +53,12 @@ def test_a_bar_without_a_total_and_one_that_is_disabled(capsys) -> None:
     assert line.startswith("steps: 3 of ?, ")
 
 
+def test_a_text_that_changes_has_one_colon(capsys) -> None:
+    with Bar(total=2, desc="references") as bar:
+        bar.set_description("reference: greedy")
+    assert capsys.readouterr().err.startswith("reference: greedy: 0 of 2, ")
+
+
 @pytest.mark.skipif(os.name != "posix", reason="needs a terminal")
 def test_a_terminal_gets_a_bar() -> None:
     import fcntl

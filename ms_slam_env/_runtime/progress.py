@@ -43,6 +43,10 @@ class Bar(tqdm):
         if self._in_terminal:
             super().clear(nolock)
 
+    def set_description(self, desc: str | None = None, refresh: bool | None = True) -> None:
+        """Change the text without tqdm's colon: both formats have one."""
+        self.set_description_str(desc, refresh)
+
     def close(self) -> None:
         """Close the bar; in a log, write a last line."""
         if not self.disable and not self._in_terminal:

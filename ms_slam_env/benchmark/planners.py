@@ -55,8 +55,8 @@ _FLOOR_M = 5e-5  # smaller errors are drawn here on logarithmic axes
 class PlannerBenchmark(Experiment):
     """Planner benchmark
 
-    Planners move the camera, a real SLAM estimates its path and maps the scene. A good planner maps
-    much soon (area under the F-score, completeness), stays tracked (small ATE) and finds back when
+    Planners move the camera; a real SLAM estimates its path and maps the scene. A good planner maps
+    much early (area under the F-score, completeness), keeps tracking (small ATE), and recovers when
     it is lost.
     """
 

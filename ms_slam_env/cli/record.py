@@ -54,7 +54,7 @@ class Args(Checked):
 
     planner: str = "nbv"
     """NAME or module:Class, options appended as in greedy,rho_I=0.3."""
-    env_id: str = chosen("MSActiveSLAM-FreeCamera-v0", *ms_slam_env.ENV_IDS)
+    env_id: str = chosen("MSActiveSLAM-FreeCamera-v0", *ms_slam_env.ENV_IDS, *ms_slam_env.TASK_IDS)
     """Environment."""
     scenes: tuple[str, ...] = ("living_room", "corridor", "table")
     """Scenes, one of which is drawn for each episode."""

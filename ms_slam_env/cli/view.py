@@ -31,7 +31,7 @@ class Args(Checked):
 
     planner: str = "nbv"
     """NAME or module:Class, options appended as in greedy,rho_I=0.3."""
-    env_id: str = chosen("MSActiveSLAM-FreeCamera-v0", *ms_slam_env.ENV_IDS)
+    env_id: str = chosen("MSActiveSLAM-FreeCamera-v0", *ms_slam_env.ENV_IDS, *ms_slam_env.TASK_IDS)
     """Environment."""
     scene: str = "living_room"
     """Name of a scene, or a mesh file."""

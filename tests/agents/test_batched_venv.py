@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from gymnasium.vector import AutoresetMode
-from ms_slam_agents import ppo, train_sb3
+from ms_slam_agents import ppo, qrdqn, train_sb3
 from ms_slam_agents.batched_venv import BatchedVecEnv
 from ms_slam_agents.policy_file import read_policy
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
@@ -50,6 +50,7 @@ def test_it_does_what_environments_in_turn_do() -> None:
             np.testing.assert_allclose(one, other, atol=1e-5)
         for info, expected in zip(ours[3], theirs[3], strict=True):
             assert info["reward_terms"] == pytest.approx(expected["reward_terms"], abs=1e-5)
+            np.testing.assert_array_equal(info["action_mask"], expected["action_mask"])
             assert ("terminal_observation" in info) == ("terminal_observation" in expected)
             if "terminal_observation" in info:
                 ended += 1
@@ -70,11 +71,22 @@ def test_episodes_that_restart_later_are_refused() -> None:
         make_batch(autoreset_mode=AutoresetMode.NEXT_STEP)
 
 
-@pytest.mark.parametrize("train", [ppo.main, train_sb3.main])
-def test_a_batch_trains_a_policy(train: Any, tmp_path: Path) -> None:
+ROLLOUTS = "--n-steps 8 --batch-size 8 --n-epochs 1"
+REPLAY = "--buffer-size 50 --learning-starts 4 --batch-size 4"
+
+
+@pytest.mark.parametrize(
+    ("train", "own"),
+    [
+        (ppo.main, ROLLOUTS),
+        (train_sb3.main, ROLLOUTS),
+        (train_sb3.main, f"--algorithm dqn {REPLAY}"),
+        (qrdqn.main, REPLAY),
+    ],
+)
+def test_a_batch_trains_a_policy(train: Any, own: str, tmp_path: Path) -> None:
     words = "--batched cpu --scenes table --scene-seeds 1 --episode-steps 4 --image-size 80x60 "
-    words += "--total-timesteps 16 --num-envs 2 --n-steps 8 --batch-size 8 --n-epochs 1 "
-    words += "--eval-episodes 2 --eval-every 0"
+    words += f"--total-timesteps 16 --num-envs 2 --eval-episodes 2 --eval-every 0 {own}"
     assert train([*words.split(), "--out", str(tmp_path)]) == 0
     assert read_policy(tmp_path / "latest.safetensors").metadata.timesteps == 16
 
@@ -82,7 +94,7 @@ def test_a_batch_trains_a_policy(train: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--also arm-kinematic", "a batch has no also"),
+        ("--also arm-kinematic", "a batch has no also; --also without a name"),
         ("--env-id MSActiveSLAM-v0", "unknown environment in a batch 'MSActiveSLAM-v0'"),
         ("--observation map", "in a batch observation must be 'features', not 'map'"),
     ],

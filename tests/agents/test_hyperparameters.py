@@ -20,6 +20,7 @@ from ms_slam_agents import (
 )
 
 from ms_slam_env.env.embodiments import EMBODIMENTS
+from ms_slam_env.env.reward import RewardConfig
 from ms_slam_env.errors import InputError
 from ms_slam_env.tasks import OWN, env_id_of
 
@@ -216,14 +217,24 @@ def test_where_it_trains_is_said_and_the_further_tasks_can_be_left_out(capsys):
     environments.say_problem(parsed(["--task", "room"]))
     said = capsys.readouterr().out
     assert said == (
-        "trains in MSActiveSLAM-Room-v0 (living_room, corridor, table, wall); and in "
-        "MSActiveSLAM-Arm-v0 (window, table, wall, carpet), as --also arm-kinematic says\n"
+        "trains in MSActiveSLAM-Room-v0 (living_room, corridor, table, wall), reward mapping; and "
+        "in MSActiveSLAM-Arm-v0 (window, table, wall, carpet), reward mapping, "
+        "as --also arm-kinematic says\n"
     )
     alone = parsed(["--task", "room", "--num-envs", "1", "--also"])
     assert (alone.also, alone.num_envs) == ((), 1)
     environments.check_problem(alone)
     environments.say_problem(alone)
-    assert capsys.readouterr().out.endswith("wall)\n")
+    assert capsys.readouterr().out.endswith("wall), reward mapping\n")
+
+
+@pytest.mark.parametrize("words", [[], ["--reward", "paper"], ["--task", "room"]])
+def test_the_reward_that_is_said_is_that_of_the_environment(words, capsys):
+    args = parsed([*words, "--num-envs", "1", "--also"])
+    environments.say_problem(args)
+    name = capsys.readouterr().out.split("reward ")[1].strip()
+    reward = environments.make_env(args, "train").unwrapped.config.reward
+    assert reward == RewardConfig.named()[name]
 
 
 @pytest.mark.parametrize(

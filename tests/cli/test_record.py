@@ -30,10 +30,10 @@ def load(out, name, monkeypatch):
     return minari.load_dataset(name)
 
 
-def replayed(seed, observation, steps=4):
+def replayed(seed, observation, steps=4, env_id="MSActiveSLAM-FreeCamera-v0"):
     """Observation, action, reward, mask and end of each step of an episode played again."""
     env = gym.make(
-        "MSActiveSLAM-FreeCamera-v0",
+        env_id,
         scene=["table"],
         split="train",
         num_scene_seeds=1,
@@ -82,6 +82,18 @@ def test_observations_of_several_parts(tmp_path, monkeypatch):
         expected = np.stack([each[part] for each in observations])
         found = episode.observations[part][:-1]
         np.testing.assert_array_equal(found, expected)  # no lossy JPEG
+
+
+def test_the_rewards_of_a_task(tmp_path, monkeypatch):
+    room = "MSActiveSLAM-Room-v0"
+    words = ("--planner", "random", "--episodes", 1, "--steps", 4, "--env-id", room)
+    assert record(tmp_path, *words) == 0
+    (episode,) = load(tmp_path, "random-v0", monkeypatch)
+    paid, plain = (
+        [reward for _, _, reward, *_ in replayed(0, "features", env_id=name)]
+        for name in (room, "MSActiveSLAM-FreeCamera-v0")
+    )
+    assert episode.rewards.tolist() == paid != plain
 
 
 @pytest.mark.parametrize("form", ["minari", "lerobot"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import ms_slam_env
 from ms_slam_env._runtime.warp import wp
 from ms_slam_env.env.batched.batched_env import BatchedActiveSlam
 from ms_slam_env.errors import InputError
+from ms_slam_env.gym_ids import BATCHED_IDS
 
 FREE, ROOM = "MSActiveSLAM-FreeCamera-v0", "MSActiveSLAM-Room-v0"
 SMALL: dict[str, Any] = {"image_size": "80x60", "num_scene_seeds": 1}
@@ -228,6 +230,13 @@ def test_an_episode_must_be_reset_by_hand_if_nothing_else_does() -> None:
 def test_what_a_batch_does_not_have_is_refused(options: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said):
         batch_of(FREE, 1, **options)
+
+
+@pytest.mark.parametrize("make", [gym.make, partial(gym.make_vec, vectorization_mode="sync")])
+@pytest.mark.parametrize("batched_id", BATCHED_IDS)
+def test_what_cannot_make_a_batch_says_what_can(make: Any, batched_id: str) -> None:
+    with pytest.raises(InputError, match=r"gym\.make_vec\(ID, num_envs=N\), without a vector"):
+        make(batched_id)
 
 
 def test_bad_actions_and_resets_are_refused() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NoReturn
 
 from ms_slam_env.env.batched.batched_env import BatchedActiveSlam
 from ms_slam_env.env.env_config import make_config
@@ -39,3 +39,15 @@ def make_batched(
     config = make_config(options, _OWN)
     own = device, max_episode_steps, autoreset_mode, start_pool
     return BatchedActiveSlam(num_envs, config, *own)
+
+
+def refuse_single(**_: Any) -> NoReturn:
+    """Say how to make a batch, where ``gym.make`` is given one of the ids in ``batched/``.
+
+    Raises:
+        InputError: always.
+    """
+    raise InputError(
+        "the ids in batched/ are made by gym.make_vec(ID, num_envs=N), without a "
+        "vectorization_mode; gym.make takes the id without batched/"
+    )
