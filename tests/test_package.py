@@ -66,7 +66,9 @@ def test_the_wheel_lists_the_experiments_of_the_product(wheel: zipfile.ZipFile, 
 sys.meta_path[:] = [finder for finder in sys.meta_path if "Editable" not in repr(finder)]
 from ms_slam_env.cli import main; main(["experiment", "list"])"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    _, *names, empty, said = done.stdout.splitlines()[1:]
+    usage, listed = done.stdout.split("\n\n", 1)
+    assert usage.startswith("usage: ms-slam experiment NAME")
+    *names, empty, said = listed.splitlines()
     assert [line.split()[0] for line in names] == ["compare", "planners", "usme"], done.stderr
     assert (empty, said) == ("", ELSEWHERE)
 

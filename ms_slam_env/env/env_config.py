@@ -261,10 +261,10 @@ def _reward(given: object) -> RewardConfig | Callable[..., Any]:
     if isinstance(given, RewardConfig):
         return given
     if not isinstance(given, str) and not callable(given):
-        weights = ", ".join(field.name for field in dataclasses.fields(RewardConfig))
+        options = ", ".join(field.name for field in dataclasses.fields(RewardConfig))
         raise InputError(
             f"reward = {given!r} must be a function of an Outcome, module:function, {named}, or a "
-            f"mapping of options: {weights}"
+            f"mapping of options: {options}"
         )
     if isinstance(given, str) and ":" not in given and given not in REWARDS.names():
         raise REWARDS.unknown(given, presets)
