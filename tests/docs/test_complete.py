@@ -52,7 +52,7 @@ def test_the_page_on_training_says_which_trainers_no_record_compares() -> None:
     commands = [str(read_results(path).provenance.get("command")) for path in ALL_RECORDS]
     judged = {name for text in commands for name in re.findall(r"^ms-slam train (\w+) --", text)}
     text = (ROOT / "docs" / "training.md").read_text()
-    (said,) = re.findall(r"judge policies of (.*?) alone: no record compares\s(.*?) with", text)
+    (said,) = re.findall(r"judge policies of (.*?) alone: no record\scompares\s(.*?) with", text)
     named, others = (set(re.findall(r"`(\w+)`", part)) for part in said)
     assert judged == named  # "rllib scaling" counts steps a second
     assert others == set(TRAINERS.names()) - named

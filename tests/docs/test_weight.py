@@ -12,7 +12,7 @@ MIB = 2**20
 LIMITS = {
     "docs/results": 6.0,
     "docs/pictures": 4.0,
-    "agents/policies": 2.3,
+    "agents/policies": 2.4,
     "ms_slam_env": 3.0,
     "experiments": 0.4,
     "tests": 2.3,
