@@ -104,13 +104,15 @@ class Panel:
     equal: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse unknown keys.
+        """Refuse unknown keys and axes.
 
         Raises:
-            InputError: a key that the registry does not know.
+            InputError: a key that the registry does not know, or other axes than x and y.
         """
         for key in filter(None, (self.x, self.y)):
             metric(key)
+        if self.log not in ("", "x", "y", "xy"):
+            raise unknown("logarithmic axes", self.log, ("x", "y", "xy"))
 
 
 @dataclass(frozen=True)

@@ -229,6 +229,12 @@ def test_tables_of_older_results_have_the_titles_of_today(tmp_path: Path) -> Non
     ]
 
 
+@pytest.mark.parametrize("log", ["9", "yx", "x ", "\ud800"])
+def test_other_axes_than_x_and_y_are_refused(log: str) -> None:
+    with pytest.raises(InputError, match=r"unknown logarithmic axes .*; valid choices: x, y, xy"):
+        Panel("steps", "ate_m", [Series("", [1], [2.0])], log)
+
+
 NO_EXPERIMENTS = {"train", "evaluation"}
 
 
