@@ -35,7 +35,7 @@ def tensors_of(model: Model) -> Tensors:
         for part, network in parts.items()
         for name, p in zip(names, network.state_dict().values(), strict=True)
     }
-    optimizer = optimizer_tensors(names, _optimizer(model).state_dict())
+    optimizer = optimizer_tensors(names, model.policy.optimizer.state_dict())
     return {**networks, **optimizer, **moment_tensors(_normalize(model))}
 
 
@@ -49,10 +49,6 @@ def epochs_of(model: Model) -> int:
 def _network(model: Model) -> torch.nn.Module:
     """The network that a policy file has."""
     return model.q_net if isinstance(model, DQN) else model.policy
-
-
-def _optimizer(model: Model) -> torch.optim.Optimizer:
-    return model.policy.optimizer
 
 
 def _names(model: Model) -> list[str]:
@@ -80,7 +76,7 @@ def restore(model: Model, file: PolicyFile) -> None:
     names = _names(model)
     _load(_network(model), file.part("policy"), names)
     if file.can_resume:
-        restore_adam(_optimizer(model), file.part("optimizer"), names)
+        restore_adam(model.policy.optimizer, file.part("optimizer"), names)
     restore_moments(_normalize(model), file)
     model.num_timesteps = file.metadata.timesteps
     if not isinstance(model, DQN):

@@ -105,15 +105,14 @@ def check_records(folder: Path, out: Path, limit_s: float, row_s: float) -> Iter
     """
     checked = RecordFile(out / "checked.jsonl")
     before = checked.load()
-    found = [one for one in find_results(folder)[0] if one.results.rows]
-    costs = {one.path: by_cost(one.results)[0].get("elapsed_s", 0.0)
-             for one in found if by_cost(one.results)}  # fmt: skip
+    found = [(rows[0].get("elapsed_s", 0.0), one)
+             for one in find_results(folder)[0] if (rows := by_cost(one.results))]  # fmt: skip
     start = time.monotonic()
-    for path, cost in sorted(costs.items(), key=lambda item: item[1]):
-        results = next(one.results for one in found if one.path == path)
-        name = path.parent.relative_to(folder).as_posix()
+    for cost, one in sorted(found, key=lambda pair: pair[0]):
+        results = one.results
+        name = one.path.parent.relative_to(folder).as_posix()
         text = str([results.content, [row["spec"] for row in results.rows]])
-        key = f"{name} {digest(path)} {sorted(sources_of(results.kind, text).items())}"
+        key = f"{name} {digest(one.path)} {sorted(sources_of(results.kind, text).items())}"
         if key in before:
             yield Checked(**before[key]["checked"])
         elif results.kind not in EXPERIMENTS.own:
@@ -123,10 +122,10 @@ def check_records(folder: Path, out: Path, limit_s: float, row_s: float) -> Iter
         elif time.monotonic() - start > limit_s:
             yield Checked(name, "not run", "the time is up")
         else:
-            one = _checked(name, results)
-            if one.outcome != "not run":
-                checked.append({"key": key, "checked": to_plain(one)})
-            yield one
+            shown = _checked(name, results)
+            if shown.outcome != "not run":
+                checked.append({"key": key, "checked": to_plain(shown)})
+            yield shown
 
 
 def _checked(name: str, results: Results) -> Checked:

@@ -357,7 +357,7 @@ def _file(text: str, kind: str, sequence: str, seed: int) -> Path:
 
 
 TRAJECTORY, FRAMES, MAP = "trajectory.txt", "frames.csv", "map.ply"
-"""Files of a run, as ms-slam run names them."""
+"""Files of a run, as in `run_to_folder`, which would load what a typo need not wait for."""
 _IN_FOLDER = {"trajectory": (".txt", TRAJECTORY), "map": (".ply", MAP)}
 """Kind of file to its suffix if it is named after the sequence, and its name in a folder."""
 

@@ -92,7 +92,7 @@ class Intrinsics:
     def field(self) -> Float64:
         """Tangents (2, 2) of the view: x / z at left and right, y / z at top and bottom border.
 
-        Those of a pinhole, rounded, so that every size of an image has the same.
+        Those of a pinhole, rounded, so that an image has the same at every size of its shape.
         """
         middle = np.array([[self.cx], [self.cy]])
         borders = np.array([[-0.5, self.width - 0.5], [-0.5, self.height - 0.5]])

@@ -18,7 +18,6 @@ from ms_slam_env._runtime.arrays import Float64
 
 CONFIDENCE = 0.95
 _PERCENTILES = (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE))
-_GROUP_RESAMPLES = 2000
 _RESAMPLES = 2000
 
 
@@ -156,13 +155,12 @@ def pooled_rank_correlation(groups: Sequence[tuple[ArrayLike, ArrayLike]]) -> In
     rng = np.random.default_rng(0)
     drawn = [
         rank_correlation(*np.concatenate([pairs[k] for k in which], axis=1))
-        for which in rng.integers(len(pairs), size=(_GROUP_RESAMPLES, len(pairs)))
+        for which in rng.integers(len(pairs), size=(_RESAMPLES, len(pairs)))
     ]
     known = [one for one in drawn if np.isfinite(one)]
     if not known:
         return Interval(value, np.nan, np.nan)
-    tail = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(known, [tail, 100 - tail])
+    low, high = np.percentile(known, _PERCENTILES)
     return Interval(value, float(low), float(high))
 
 

@@ -164,6 +164,17 @@ def test_an_object_takes_the_same_route_at_every_size(box_scene, path, kind) -> 
         np.testing.assert_array_equal(route(size), expected)
 
 
+def test_a_lamp_takes_the_same_route_at_every_size(box_scene, path) -> None:
+    camera = PoseInterpolation(np.arange(FRAMES) / 30, path)
+
+    def route(size: str) -> np.ndarray:
+        light = Illumination(lamp=1.0).light(box_scene, camera, xtion(size), 1)
+        return np.array([light._lamp.position(t) for t in np.linspace(0.0, 2.0, 9)])
+
+    for size in ("64x48", "100x75", "640x480"):
+        np.testing.assert_array_equal(route(size), route("40x30"))
+
+
 @given(st.floats(0.3, 3.0), st.floats(0.05, 0.4), st.floats(0.1, 3.0), st.floats(0.5, 4.0))
 @settings(max_examples=25)
 def test_tracks_keep_their_pace(length, half_width, speed, turning) -> None:
